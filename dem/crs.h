@@ -1,0 +1,36 @@
+/* What coordinate reference systems mean: from GeoTIFF keys or WKT, to longitude and latitude, to local frames. */
+#ifndef DEM_CRS_H
+#define DEM_CRS_H
+
+#include "lib/base/georef.h"
+
+struct tiff; /* libtiff's TIFF */
+
+/* The CRS of an open GeoTIFF, with one reference; *out is NULL where the file has none. The keys are kept in it. */
+tl_status dem_crs_from_tiff(struct tiff *tiff, const char *path, tl_crs **out, tl_error *error);
+/* The CRS of a WKT text (any version), "EPSG:CODE" or a PROJ string; `path` names the file that it is from in messages.
+ */
+tl_status dem_crs_from_text(const char *text, const char *path, tl_crs **out, tl_error *error);
+
+/* From coordinates of a CRS to longitude and latitude in degrees on its own datum. Thread-safe as long as each thread
+ * has its own. */
+typedef struct dem_projection dem_projection;
+dem_projection *dem_projection_create(const tl_crs *crs, tl_error *error);
+void dem_projection_destroy(dem_projection *projection);
+/* In place, n points; x, y become longitude, latitude. What cannot be transformed becomes NaN. */
+void dem_projection_to_lonlat(dem_projection *projection, size_t n, double *x, double *y);
+
+/* Metres east, north and up in the plane tangent to the ellipsoid at an origin. */
+typedef struct dem_local_frame dem_local_frame;
+dem_local_frame *dem_local_frame_create(const tl_crs *crs, double longitude, double latitude, double height,
+                                        tl_error *error);
+void dem_local_frame_destroy(dem_local_frame *frame);
+/* Longitude, latitude (degrees) and height (metres) to xyz[3]. */
+void dem_local_frame_forward(const dem_local_frame *frame, double longitude, double latitude, double height,
+                             double xyz[3]);
+
+/* Fills in cell_x and cell_y of `georef`, whose crs, located and transform are set, for a raster of width x height
+ * samples. */
+tl_status dem_georef_measure(tl_georef *georef, int64_t width, int64_t height, tl_error *error);
+
+#endif

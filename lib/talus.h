@@ -1,0 +1,374 @@
+/* talus: terrain with detail below the resolution of its elevation model.
+ *
+ * This header is the whole public interface, and its manual. Conventions that hold throughout:
+ *
+ * - A *source* is anything that has heights on a grid. Sample (i, j) is column i, row j, both from 0,
+ *   row 0 the first of the file (north, for most rasters). A height that is not known (a void) is NaN.
+ * - *Levels* name lattices: level 0 is the elevation model's own samples, level l > 0 has half the
+ *   spacing of level l - 1. A source holds the levels up to its own `info.level`.
+ * - Functions that can fail return a tl_status (TL_OK is 0) or NULL, and describe the failure in the
+ *   caller's tl_error, one line that names the file, the thing and the remedy. The tl_error pointer may
+ *   be NULL. A failed call leaves its outputs untouched and nothing half-written on disk.
+ * - Option structs: zero is the default of every member, so name only what you change.
+ * - Everything returned by a create or open function is the caller's, until the matching destroy; a
+ *   destroyer takes NULL. A source borrows the source that it was made from: destroy it first.
+ * - A const tl_source may be read by any number of threads at once. Equal inputs give equal bytes,
+ *   whatever the number of threads, the order of reading or the instruction set.
+ * - Breaking a stated precondition (a NULL that is not allowed, a window outside of the grid) is a
+ *   programming error and may end in a failed assertion.
+ */
+#ifndef TALUS_H
+#define TALUS_H
+
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#if defined(TL_BUILDING) && defined(__GNUC__)
+#define TL_API __attribute__((visibility("default")))
+#else
+#define TL_API
+#endif
+
+/* The version of the library, as "0.1.0". */
+TL_API const char *tl_version(void);
+
+/* ---- Errors ------------------------------------------------------------------------------------ */
+
+typedef enum tl_status {
+    TL_OK = 0,
+    TL_ERROR_ARGUMENT,  /* an option or parameter that cannot be honoured */
+    TL_ERROR_DATA,      /* the input is malformed, or of a kind that talus does not take */
+    TL_ERROR_IO,        /* the system refused to read or write */
+    TL_ERROR_MEMORY,    /* not enough memory */
+    TL_ERROR_CANCELLED, /* tl_run.cancel was raised */
+} tl_status;
+
+/* A failure, described. The caller owns it; `text` is one line without a newline at its end. */
+typedef struct tl_error {
+    tl_status status;
+    char text[480];
+} tl_error;
+
+/* A short English name of a status, as "I/O error"; never NULL. */
+TL_API const char *tl_status_name(tl_status status);
+
+/* ---- Running: threads, progress, cancellation -------------------------------------------------- */
+
+/* How long-running calls run. NULL where a tl_run is asked for means all defaults. */
+typedef struct tl_run {
+    unsigned threads; /* worker threads; 0: one a processor that this process may use */
+    const volatile int
+        *cancel; /* polled; when it becomes non-zero the call ends with TL_ERROR_CANCELLED; NULL: never */
+    /* Called on the calling thread only, at most about ten times a second and once at the end, with the
+     * work done and the whole work in samples. NULL: not wanted. */
+    void (*progress)(void *user, uint64_t done, uint64_t total);
+    void *user; /* handed to progress */
+} tl_run;
+
+/* ---- Georeference ------------------------------------------------------------------------------ */
+
+/* What a sample stands for. An area sample is the mean over its cell, a point sample the height at its
+ * position (GeoTIFF's RasterPixelIsArea and RasterPixelIsPoint). */
+typedef enum tl_raster_type { TL_RASTER_AREA = 0, TL_RASTER_POINT } tl_raster_type;
+
+/* A coordinate reference system, shared and immutable; reference-counted by its owners. */
+typedef struct tl_crs tl_crs;
+
+/* Name of the CRS, as "NAD83 / UTM zone 11N"; never NULL. */
+TL_API const char *tl_crs_name(const tl_crs *crs);
+/* WKT2:2019 of the CRS on one line; "" where it cannot be had. */
+TL_API const char *tl_crs_wkt(const tl_crs *crs);
+/* EPSG code of the CRS, 0 where it has none. */
+TL_API int tl_crs_epsg(const tl_crs *crs);
+/* Whether its coordinates are longitude and latitude (in degrees, in this order, always). */
+TL_API bool tl_crs_is_geographic(const tl_crs *crs);
+
+/* Where a grid lies. Positions are those of samples: for area rasters the cells' centres, for point rasters
+ * the points themselves, so that half-cell conventions end at the readers and writers. */
+typedef struct tl_georef {
+    const tl_crs *crs; /* NULL: not known */
+    bool located;      /* whether `transform` comes from the data; else it is {0,1,0, 0,0,-1}: x = i, y = -j */
+    /* CRS coordinates of sample (i, j): x = t[0] + t[1] i + t[2] j, y = t[3] + t[4] i + t[5] j. */
+    double transform[6];
+    /* Metres between neighbouring samples along a row and along a column, at the middle of the raster
+     * (geodesic where the CRS is geographic). One unit of an unknown CRS counts as a metre. */
+    double cell_x, cell_y;
+    double height_unit; /* metres in one unit of height, 1 where the file does not say otherwise */
+} tl_georef;
+
+/* ---- Sources ----------------------------------------------------------------------------------- */
+
+/* A rectangle of samples: columns x ... x + width - 1, rows y ... y + height - 1. */
+typedef struct tl_window {
+    int64_t x, y;
+    int64_t width, height;
+} tl_window;
+
+/* A parameter that made a source, for the record that travels with every output. Both strings are UTF-8. */
+typedef struct tl_parameter {
+    const char *name, *value;
+} tl_parameter;
+
+typedef struct tl_source_info {
+    int64_t width, height; /* samples, at level `level`; both at least 1 */
+    int level;             /* the finest level that it holds: 0 for elevation models */
+    tl_raster_type type;
+    tl_georef georef; /* of the samples of level `level` */
+    bool has_voids;   /* false: certainly no NaN; true: NaN may occur */
+    double quantum; /* step between representable heights (1 for an integer DEM without scale), 0 for continuous ones */
+    const char *name;               /* what to call it in messages: the file, mostly; never NULL */
+    const tl_parameter *parameters; /* how it was made; NULL when parameter_count is 0 */
+    size_t parameter_count;
+} tl_source_info;
+
+/* A grid of heights. Make your own by filling in this struct: it is the whole contract. */
+typedef struct tl_source tl_source;
+struct tl_source {
+    tl_source_info info;
+    /* Writes the window's heights, row by row without gaps, to out[window.width * window.height].
+     * `level` must be one that the source holds: `info.level` always is; coarser ones are those for which
+     * tl_source_size succeeds. Thread-safe. */
+    tl_status (*read)(const tl_source *self, int level, tl_window window, float *out, tl_error *error);
+    /* Size at a coarser level than info.level; NULL: only info.level is held. */
+    tl_status (*size)(const tl_source *self, int level, int64_t *width, int64_t *height, tl_error *error);
+    void (*destroy)(tl_source *self); /* NULL: nothing to free */
+};
+
+/* Size in samples at a level that the source holds; TL_ERROR_ARGUMENT for others. */
+TL_API tl_status tl_source_size(const tl_source *source, int level, int64_t *width, int64_t *height, tl_error *error);
+/* Reads a window, which must lie inside of the grid of that level. */
+TL_API tl_status tl_source_read(const tl_source *source, int level, tl_window window, float *out, tl_error *error);
+TL_API void tl_source_destroy(tl_source *source);
+
+/* A source over the caller's array of info->width * info->height heights, which must outlive it (as must
+ * all that `info` points to). info->level must be 0. */
+TL_API tl_source *tl_array_source_create(const float *heights, const tl_source_info *info, tl_error *error);
+
+/* Opens a raster that talus can read, by its content: GeoTIFF, or an EXR heightfield that talus wrote. */
+TL_API tl_source *tl_open(const char *path, tl_error *error);
+
+/* ---- Elevation models -------------------------------------------------------------------------- */
+
+typedef struct tl_dem_options {
+    unsigned band; /* counted from 1; 0: the first */
+} tl_dem_options;
+
+/* Opens the GeoTIFF `path`. Nothing but its directory is read yet. */
+TL_API tl_source *tl_dem_open(const char *path, const tl_dem_options *options, tl_error *error);
+
+/* What a GeoTIFF says of itself; strings live as long as the source. */
+typedef struct tl_dem_details {
+    const char *sample_type; /* "int16", "float32", ... */
+    const char *codec;       /* "deflate", "lzw", "none", ... */
+    int predictor;           /* 1, 2 or 3, as in the TIFF tag */
+    bool tiled, big_tiff, big_endian;
+    int64_t block_width, block_height;
+    unsigned bands, band; /* band counted from 1 */
+    bool has_nodata;
+    double nodata;        /* as in the GDAL_NODATA tag */
+    double scale, offset; /* height = offset + scale * stored */
+    unsigned overviews;   /* reduced-resolution copies in the file */
+    int64_t bytes;        /* size of the file */
+} tl_dem_details;
+
+/* Details of a source that tl_dem_open made; TL_ERROR_ARGUMENT for any other. */
+TL_API tl_status tl_dem_get_details(const tl_source *dem, tl_dem_details *out, tl_error *error);
+
+/* Range and void share of a source's finest level, read once from end to end. */
+typedef struct tl_range {
+    float low, high; /* NaN where no sample is valid */
+    uint64_t samples, voids;
+    double mean; /* of the valid samples */
+} tl_range;
+
+TL_API tl_status tl_source_range(const tl_source *source, const tl_run *run, tl_range *out, tl_error *error);
+
+/* ---- Meshes ------------------------------------------------------------------------------------ */
+
+/* A vertex at the sample (i, j) of a grid, height z in the grid's unit. */
+typedef struct tl_vertex {
+    int32_t i, j;
+    float z;
+} tl_vertex;
+
+/* Triangles over the samples of one grid. Counter-clockwise as seen from above when j points south
+ * (so that the faces look up in every right-handed frame with z upwards). */
+typedef struct tl_mesh {
+    size_t vertex_count, triangle_count;
+    tl_vertex *vertices;
+    uint32_t *indices; /* 3 * triangle_count */
+    tl_georef georef;  /* of the grid; the mesh holds a reference to its CRS */
+    tl_raster_type type;
+    double max_error;         /* the bound it was made under, in units of height; 0: every sample is a vertex */
+    tl_parameter *parameters; /* how it was made, owned by the mesh */
+    size_t parameter_count;
+} tl_mesh;
+
+TL_API void tl_mesh_destroy(tl_mesh *mesh);
+
+/* The full grid as a mesh: two triangles a cell, none where a corner is void (one where only one is). Grids
+ * of more than 2^31 samples are refused. */
+TL_API tl_status tl_mesh_from_source(const tl_source *source, const tl_run *run, tl_mesh **out, tl_error *error);
+
+/* What a rescan of a mesh against every sample of a grid finds. */
+typedef struct tl_mesh_report {
+    double max_error; /* largest |mesh - sample|, in units of height */
+    double rms_error;
+    int64_t worst_i, worst_j; /* where it is; -1 where no sample is covered */
+    uint64_t samples;         /* valid samples that a triangle covers */
+    uint64_t uncovered;       /* valid samples that no triangle covers */
+} tl_mesh_report;
+
+/* Compares a mesh (of vertices on the source's finest grid) with every sample of the source, in double
+ * precision, triangle by triangle. */
+TL_API tl_status tl_mesh_verify(const tl_mesh *mesh, const tl_source *source, const tl_run *run, tl_mesh_report *out,
+                                tl_error *error);
+
+/* ---- Framework --------------------------------------------------------------------------------- */
+
+/* The characteristic points of an elevation model under a strict error bound: the restricted quadtree
+ * triangulation (right isosceles triangles by longest-edge bisection) in which no sample is farther than
+ * max_error from the surface. */
+typedef struct tl_framework tl_framework;
+
+typedef struct tl_framework_options {
+    double max_error; /* largest vertical distance allowed at any sample, in units of height; >= 0 */
+    const tl_run *run;
+} tl_framework_options;
+
+TL_API tl_framework *tl_framework_build(const tl_source *dem, const tl_framework_options *options, tl_error *error);
+TL_API void tl_framework_destroy(tl_framework *framework);
+
+/* Number of characteristic points. */
+TL_API size_t tl_framework_point_count(const tl_framework *framework);
+/* Valid samples that are no corner of any triangle, because they have too few valid neighbours to span one. */
+TL_API size_t tl_framework_isolated_count(const tl_framework *framework);
+/* Whether sample (i, j), which must lie in the grid, is a characteristic point. */
+TL_API bool tl_framework_has_point(const tl_framework *framework, int64_t i, int64_t j);
+/* The conforming mesh over the characteristic points; it does not need the DEM any more. */
+TL_API tl_status tl_framework_mesh(const tl_framework *framework, tl_mesh **out, tl_error *error);
+
+/* ---- The field --------------------------------------------------------------------------------- */
+
+/* A way to refine a lattice, found by name. */
+typedef struct tl_scheme {
+    const char *name;    /* "stationary" */
+    const char *summary; /* one line */
+} tl_scheme;
+
+/* The schemes, ended by an entry whose name is NULL. The first is the default. */
+TL_API const tl_scheme *tl_schemes(void);
+
+typedef struct tl_field_options {
+    int levels;         /* halvings of the DEM's spacing, 0 ... 30 */
+    const char *scheme; /* a name of tl_schemes(); NULL: the default */
+    bool hurst_given, delta_given;
+    double hurst; /* Hurst exponent in (0, 1) of every level below the DEM; where not given, measured from the DEM */
+    double delta; /* standard deviation of the height difference of neighbouring DEM samples in the fractal model,
+                     in units of height, >= 0; where not given, measured from the DEM */
+    uint64_t seed;
+    const tl_run *run; /* for the measurement, which reads the DEM once */
+} tl_field_options;
+
+/* The terrain below the DEM's samples: a source at level options->levels. A point raster of W x H samples
+ * becomes (W-1) 2^l + 1 by (H-1) 2^l + 1, and every 2^l-th sample is the DEM's own. An area raster becomes
+ * W 2^l by H 2^l cells on the same footprint. Voids stay voids. */
+TL_API tl_source *tl_field_create(const tl_source *dem, const tl_field_options *options, tl_error *error);
+
+/* Roughness of an elevation model: the detail that its finest halving of spacing added. */
+typedef struct tl_roughness {
+    bool measurable; /* false: too small, too flat or too void to tell; the rest is then 0 */
+    double sigma;    /* standard deviation of the detail of the finest octave, units of height */
+    double hurst;    /* exponent between the two finest octaves; above 1 on smooth hillslopes */
+} tl_roughness;
+
+TL_API tl_status tl_roughness_measure(const tl_source *dem, const tl_run *run, tl_roughness *out, tl_error *error);
+
+typedef struct tl_noise_options {
+    int64_t size; /* samples on a side, at least 1 */
+    double hurst; /* in (0, 1) */
+    double delta; /* standard deviation of the height difference over one sample, >= 0 */
+    uint64_t seed;
+    const char *scheme; /* a name of tl_schemes(); NULL: the default */
+} tl_noise_options;
+
+/* A fractional Brownian surface of size x size samples at unit spacing: S(h) = delta^2 |h|^(2 hurst). */
+TL_API tl_source *tl_noise_create(const tl_noise_options *options, tl_error *error);
+
+/* ---- Writing ----------------------------------------------------------------------------------- */
+
+/* A format that talus writes, found by the ending of the file's name. */
+typedef struct tl_format {
+    const char *ending;  /* "exr", without the dot, lower case */
+    const char *summary; /* one line */
+    bool grid, mesh;     /* what it holds */
+} tl_format;
+
+/* The formats, ended by an entry whose ending is NULL. */
+TL_API const tl_format *tl_formats(void);
+/* The format of a path by its ending, upper or lower case; NULL where there is none. */
+TL_API const tl_format *tl_format_of(const char *path);
+
+/* Coordinates of mesh vertices. */
+typedef enum tl_frame {
+    TL_FRAME_DEFAULT = 0, /* ENU where the CRS is known, else projected */
+    TL_FRAME_ENU,         /* metres east, north and up of the tangent plane at the grid's middle (glTF: its Y up) */
+    TL_FRAME_PROJECTED,   /* CRS coordinates and heights as they are */
+    TL_FRAME_PIXEL,       /* column, row (downwards), height: sample positions, not cell corners */
+} tl_frame;
+
+typedef enum tl_compression {
+    TL_COMPRESSION_DEFAULT = 0, /* EXR: zip; GeoTIFF: deflate */
+    TL_COMPRESSION_NONE,
+    TL_COMPRESSION_ZIP,  /* EXR (16 rows at a time), and deflate for GeoTIFF */
+    TL_COMPRESSION_ZIPS, /* EXR (row by row) */
+    TL_COMPRESSION_PIZ,  /* EXR (wavelet) */
+} tl_compression;
+
+typedef struct tl_write_options {
+    bool overwrite; /* replace an existing file; else TL_ERROR_IO */
+    tl_compression compression;
+    tl_frame frame;
+    const tl_run *run;
+} tl_write_options;
+
+/* Writes the finest level of a source to `path`, in the format of its ending (EXR, GeoTIFF, 16-bit PNG with a
+ * JSON file beside it, or a full mesh). Tiles are made in parallel and written as they come, so memory does not
+ * grow with the output. The file appears under its name only when it is complete. */
+TL_API tl_status tl_write_grid(const tl_source *source, const char *path, const tl_write_options *options,
+                               tl_error *error);
+/* Writes a mesh to `path` (GLB, OBJ or PLY by its ending). */
+TL_API tl_status tl_write_mesh(const tl_mesh *mesh, const char *path, const tl_write_options *options, tl_error *error);
+
+/* ---- Pictures ---------------------------------------------------------------------------------- */
+
+typedef struct tl_preview_options {
+    int width, height; /* pixels; 0: the source's own shape, at most 2048 on the longer side (hillshade), 1920 x 1080
+                          (perspective) */
+    double sun_azimuth, sun_elevation; /* degrees, clockwise from north and above the horizon; both 0: 315 and 45 */
+    double exaggeration;               /* factor on heights; 0: 1 */
+    bool grey;                         /* no hypsometric colours */
+    bool perspective;                  /* look from `eye` to `target` instead of straight down */
+    /* CRS coordinates (or columns and negative rows where there is no CRS) and height above the datum in metres. */
+    double eye[3], target[3];
+    bool view_given; /* false: a view over the whole raster from the south is chosen */
+    double fov;      /* horizontal field of view in degrees, 1 ... 170; 0: 50 */
+    bool overwrite;
+    const tl_run *run;
+} tl_preview_options;
+
+/* Draws a source as a PNG: hillshade from above, or a perspective. Voids are transparent. `beside` may name a
+ * second source, drawn to the right of the first with the same colours and the same footprint; hillshade only. */
+TL_API tl_status tl_write_preview(const tl_source *source, const tl_source *beside, const char *path,
+                                  const tl_preview_options *options, tl_error *error);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif
