@@ -1,0 +1,203 @@
+#include "cmd/command.h"
+
+#include <jansson.h>
+#include <math.h>
+#include <stdio.h>
+#include <string.h>
+
+typedef struct settings {
+    common common;
+    bool json;
+} settings;
+
+typedef struct facts {
+    const tl_source_info *info;
+    tl_dem_details details; /* of a GeoTIFF only */
+    bool has_details;
+    tl_range range;
+    tl_roughness roughness;
+} facts;
+
+/* CRS coordinates of the footprint: cells for area rasters, samples for points. */
+static void extent(const tl_source_info *info, double low[2], double high[2])
+{
+    double margin = info->type == TL_RASTER_AREA ? 0.5 : 0;
+    const double *t = info->georef.transform;
+    low[0] = low[1] = INFINITY;
+    high[0] = high[1] = -INFINITY;
+    for (int corner = 0; corner < 4; corner++) {
+        double i = corner & 1 ? (double)info->width - 1 + margin : -margin;
+        double j = corner & 2 ? (double)info->height - 1 + margin : -margin;
+        for (int k = 0; k < 2; k++) {
+            double value = t[3 * k] + t[3 * k + 1] * i + t[3 * k + 2] * j;
+            low[k] = fmin(low[k], value);
+            high[k] = fmax(high[k], value);
+        }
+    }
+}
+
+static json_t *number(double value)
+{
+    return isfinite(value) ? json_real(value) : json_null();
+}
+
+static json_t *georef_json(const tl_source_info *info)
+{
+    const tl_georef *g = &info->georef;
+    double low[2], high[2];
+    extent(info, low, high);
+    json_t *transform = json_array();
+    for (int k = 0; k < 6; k++)
+        json_array_append_new(transform, json_real(g->transform[k]));
+    json_t *object =
+        json_pack("{s:b, s:o, s:[o,o,o,o], s:[o,o], s:o}", "located", g->located, "sample_transform", transform,
+                  "extent", number(low[0]), number(low[1]), number(high[0]), number(high[1]), "cell_metres",
+                  number(g->cell_x), number(g->cell_y), "height_unit_metres", number(g->height_unit));
+    json_t *crs = json_null();
+    if (g->crs)
+        crs = json_pack("{s:s, s:o, s:b, s:s}", "name", tl_crs_name(g->crs), "epsg",
+                        tl_crs_epsg(g->crs) ? json_integer(tl_crs_epsg(g->crs)) : json_null(), "geographic",
+                        tl_crs_is_geographic(g->crs), "wkt", tl_crs_wkt(g->crs));
+    json_object_set_new(object, "crs", crs);
+    return object;
+}
+
+static json_t *file_json(const tl_dem_details *d)
+{
+    return json_pack("{s:s, s:s, s:i, s:s, s:[I,I], s:b, s:s, s:i, s:i, s:o, s:f, s:f, s:i, s:I}", "type",
+                     d->sample_type, "codec", d->codec, "predictor", d->predictor, "layout",
+                     d->tiled ? "tiles" : "strips", "block", (json_int_t)d->block_width, (json_int_t)d->block_height,
+                     "bigtiff", d->big_tiff, "byte_order", d->big_endian ? "big" : "little", "bands", (int)d->bands,
+                     "band", (int)d->band, "nodata", d->has_nodata ? number(d->nodata) : json_null(), "scale", d->scale,
+                     "offset", d->offset, "overviews", (int)d->overviews, "bytes", (json_int_t)d->bytes);
+}
+
+static void print_json(const facts *f)
+{
+    const tl_source_info *info = f->info;
+    json_t *object = json_pack("{s:s, s:I, s:I, s:i, s:s, s:f, s:o}", "name", info->name, "width",
+                               (json_int_t)info->width, "height", (json_int_t)info->height, "level", info->level,
+                               "raster_type", info->type == TL_RASTER_AREA ? "area" : "point", "quantum", info->quantum,
+                               "georeference", georef_json(info));
+    if (!object) { /* jansson refuses strings that are not UTF-8 */
+        complain("%s: its name or CRS is not UTF-8, so it cannot be told in JSON", info->name);
+        return;
+    }
+    json_object_set_new(object, "file", f->has_details ? file_json(&f->details) : json_null());
+    json_object_set_new(object, "heights",
+                        json_pack("{s:o, s:o, s:o, s:I, s:I}", "low", number((double)f->range.low), "high",
+                                  number((double)f->range.high), "mean", number(f->range.mean), "samples",
+                                  (json_int_t)f->range.samples, "voids", (json_int_t)f->range.voids));
+    json_object_set_new(object, "roughness",
+                        f->roughness.measurable
+                            ? json_pack("{s:f, s:f}", "sigma", f->roughness.sigma, "hurst", f->roughness.hurst)
+                            : json_null());
+    json_t *parameters = json_object();
+    for (size_t i = 0; i < info->parameter_count; i++)
+        json_object_set_new(parameters, info->parameters[i].name, json_string(info->parameters[i].value));
+    json_object_set_new(object, "parameters", parameters);
+    json_dumpf(object, stdout, JSON_INDENT(2) | JSON_REAL_PRECISION(15));
+    putchar('\n');
+    json_decref(object);
+}
+
+static void print_file(const tl_dem_details *d)
+{
+    printf("file         %lld bytes, %s%s-endian, %s, codec %s", (long long)d->bytes, d->big_tiff ? "BigTIFF, " : "",
+           d->big_endian ? "big" : "little", d->sample_type, d->codec);
+    if (d->predictor > 1)
+        printf(" with predictor %d", d->predictor);
+    printf(", %s of %lld x %lld\n", d->tiled ? "tiles" : "strips", (long long)d->block_width,
+           (long long)d->block_height);
+    if (d->bands > 1)
+        printf("band         %u of %u\n", d->band, d->bands);
+    if (d->overviews)
+        printf("overviews    %u\n", d->overviews);
+    if (d->has_nodata)
+        printf("nodata       %.9g\n", d->nodata);
+    if (d->scale != 1 || d->offset != 0)
+        printf("heights are  %g + %g * stored\n", d->offset, d->scale);
+}
+
+static void print_place(const tl_source_info *info)
+{
+    const tl_georef *g = &info->georef;
+    double low[2], high[2];
+    extent(info, low, high);
+    printf("CRS          %s", g->crs ? tl_crs_name(g->crs) : "unknown");
+    if (g->crs && tl_crs_epsg(g->crs))
+        printf(" (EPSG:%d)", tl_crs_epsg(g->crs));
+    putchar('\n');
+    if (g->located)
+        printf("extent       %.10g ... %.10g, %.10g ... %.10g\n", low[0], high[0], low[1], high[1]);
+    else
+        printf("extent       unknown: the file does not say where it lies\n");
+    printf("cell         %.6g x %.6g m%s\n", g->cell_x, g->cell_y, g->crs ? "" : " (taken for metres)");
+}
+
+static void print_text(const facts *f)
+{
+    const tl_source_info *info = f->info;
+    printf("%s\nsize         %lld x %lld samples, %s\n", info->name, (long long)info->width, (long long)info->height,
+           info->type == TL_RASTER_AREA ? "each the mean of its cell (area)" : "each a point");
+    if (f->has_details)
+        print_file(&f->details);
+    print_place(info);
+    const tl_range *r = &f->range;
+    if (r->voids < r->samples)
+        printf("heights      %.9g ... %.9g, mean %.6g", (double)r->low, (double)r->high, r->mean);
+    else
+        printf("heights      none: every sample is void");
+    printf(info->quantum > 0 ? ", in steps of %g\n" : "\n", info->quantum);
+    printf("voids        %llu of %llu samples (%.3g %%)\n", (unsigned long long)r->voids,
+           (unsigned long long)r->samples, 100 * (double)r->voids / (double)r->samples);
+    if (f->roughness.measurable)
+        printf("roughness    sigma %.4g over the finest octave, exponent %.3g\n", f->roughness.sigma,
+               f->roughness.hurst);
+    for (size_t i = 0; i < info->parameter_count; i++)
+        printf("%s%s: %s\n", i ? "             " : "made by      ", info->parameters[i].name,
+               info->parameters[i].value);
+}
+
+static int inform(const settings *set, const char *input)
+{
+    progress bar;
+    tl_error error;
+    tl_run run = command_run(&set->common, &bar);
+    tl_source *source = tl_open(input, &error);
+    if (!source)
+        return command_failed(&bar, &error);
+    facts f = {.info = &source->info};
+    f.has_details = tl_dem_get_details(source, &f.details, NULL) == TL_OK;
+    int status = EXIT_DONE;
+    progress_stage(&bar, "reading");
+    if (tl_source_range(source, &run, &f.range, &error) != TL_OK ||
+        tl_roughness_measure(source, &run, &f.roughness, &error) != TL_OK)
+        status = command_failed(&bar, &error);
+    else {
+        progress_end(&bar);
+        (set->json ? print_json : print_text)(&f);
+        status = command_done();
+    }
+    tl_source_destroy(source);
+    return status;
+}
+
+static int run(const command *self, int argc, const char **argv, bool help)
+{
+    settings set = {0};
+    const option output[] = {
+        {"json", 'j', OPTION_FLAG, &set.json, NULL, NULL, "for machines: one JSON object", 0, 0, NULL}, {0}};
+    const option running[] = {COMMON_RUNNING(set.common), {0}};
+    const option_group groups[] = {{"Output", output}, {"Running", running}, {0}};
+    arguments rest;
+    int status;
+    if (!command_begin(self, argc, argv, help, groups, 1, &rest, &status))
+        return status;
+    status = inform(&set, rest.names[0]);
+    arguments_free(&rest);
+    return status;
+}
+
+const command command_info = {"info", "tell what a raster holds", "RASTER [--json]",
+                              "RASTER is a GeoTIFF, or an EXR that talus wrote.", run};

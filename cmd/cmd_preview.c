@@ -1,0 +1,109 @@
+#include "cmd/command.h"
+
+#include <stdlib.h>
+#include <string.h>
+
+typedef struct settings {
+    common common;
+    tl_preview_options preview;
+    const char *beside;
+    int64_t width, height;
+    bool eye_given, target_given;
+} settings;
+
+static bool ends_with_png(const char *path)
+{
+    size_t length = strlen(path);
+    return length > 4 && (strcmp(path + length - 4, ".png") == 0 || strcmp(path + length - 4, ".PNG") == 0);
+}
+
+static bool settings_ok(settings *set)
+{
+    if (!set->common.output || !ends_with_png(set->common.output)) {
+        complain("a name that ends with .png is wanted behind -o");
+        return false;
+    }
+    if (set->eye_given != set->target_given) {
+        complain("--eye and --target go together");
+        return false;
+    }
+    set->preview.view_given = set->eye_given;
+    set->preview.perspective |= set->eye_given;
+    if (set->preview.perspective && set->beside) {
+        complain("--beside goes with a hillshade, not with a perspective");
+        return false;
+    }
+    set->preview.width = (int)set->width;
+    set->preview.height = (int)set->height;
+    set->preview.overwrite = set->common.overwrite;
+    return true;
+}
+
+static int draw(settings *set, const char *input)
+{
+    progress bar;
+    tl_error error;
+    tl_run run = command_run(&set->common, &bar);
+    set->preview.run = &run;
+    tl_source *source = tl_open(input, &error);
+    tl_source *beside = source && set->beside ? tl_open(set->beside, &error) : NULL;
+    int status = EXIT_DONE;
+    progress_stage(&bar, "drawing");
+    if (!source || (set->beside && !beside) ||
+        tl_write_preview(source, beside, set->common.output, &set->preview, &error) != TL_OK)
+        status = command_failed(&bar, &error);
+    else
+        command_say(&set->common, "%s: drawn in %.2f s", set->common.output, progress_end(&bar));
+    tl_source_destroy(beside);
+    tl_source_destroy(source);
+    return status;
+}
+
+static int run(const command *self, int argc, const char **argv, bool help)
+{
+    settings set = {.preview = {.sun_azimuth = 315, .sun_elevation = 45, .exaggeration = 1, .fov = 50}};
+    const option picture[] = {
+        {"width", 0, OPTION_INTEGER, &set.width, NULL, "N",
+         "pixels, 1...32768 (default: the raster's own, at most 2048; 1920 in perspective)", 1, 32768, NULL},
+        {"height", 0, OPTION_INTEGER, &set.height, NULL, "N",
+         "pixels, 1...32768 (default: by the raster's shape; 1080 in perspective)", 1, 32768, NULL},
+        {"beside", 0, OPTION_TEXT, &set.beside, NULL, "FILE", "a second raster of the same place, drawn to the right",
+         0, 0, NULL},
+        {"grey", 0, OPTION_FLAG, &set.preview.grey, NULL, NULL, "shade only, no colours by height", 0, 0, NULL},
+        {0}};
+    const option light[] = {{"sun-azimuth", 0, OPTION_NUMBER, &set.preview.sun_azimuth, NULL, "DEG",
+                             "clockwise from north, 0...360 (default: 315)", 0, 360, NULL},
+                            {"sun-elevation", 0, OPTION_NUMBER, &set.preview.sun_elevation, NULL, "DEG",
+                             "above the horizon, 1...90 (default: 45)", 1, 90, NULL},
+                            {"exaggeration", 0, OPTION_NUMBER, &set.preview.exaggeration, NULL, "X",
+                             "factor on heights, 0.01...100 (default: 1)", 0.01, 100, NULL},
+                            {0}};
+    const option view[] = {
+        {"perspective", 'p', OPTION_FLAG, &set.preview.perspective, NULL, NULL,
+         "a perspective over the whole raster, from the south", 0, 0, NULL},
+        {"eye", 0, OPTION_TRIPLE, set.preview.eye, &set.eye_given, "X,Y,HEIGHT",
+         "where to look from: CRS coordinates (longitude,latitude where geographic), metres above the datum", 0, 0,
+         NULL},
+        {"target", 0, OPTION_TRIPLE, set.preview.target, &set.target_given, "X,Y,HEIGHT", "where to look", 0, 0, NULL},
+        {"fov", 0, OPTION_NUMBER, &set.preview.fov, NULL, "DEG", "horizontal field of view, 1...170 (default: 50)", 1,
+         170, NULL},
+        {0}};
+    const option output[] = {COMMON_OUTPUT(set.common), {0}};
+    const option running[] = {COMMON_RUNNING(set.common), {0}};
+    const option_group groups[] = {{"Picture", picture}, {"Light", light},     {"View", view},
+                                   {"Output", output},   {"Running", running}, {0}};
+    arguments rest;
+    int status;
+    if (!command_begin(self, argc, argv, help, groups, 1, &rest, &status))
+        return status;
+    status = settings_ok(&set) ? draw(&set, rest.names[0]) : EXIT_USAGE;
+    arguments_free(&rest);
+    return status;
+}
+
+const command command_preview = {
+    "preview", "draw a raster: hillshade, or a perspective", "RASTER -o PICTURE.png",
+    "RASTER is a GeoTIFF, or an EXR that talus wrote. Voids are transparent.\n\n"
+    "Examples: talus preview terrain.exr -o look.png\n"
+    "          talus preview terrain.exr --eye -84.3,36.4,3000 --target -84.2,36.5,400 -o view.png",
+    run};

@@ -1,0 +1,122 @@
+#include "cmd/command.h"
+
+#include <stdio.h>
+
+static const char *const frames[] = {[TL_FRAME_DEFAULT] = "default",
+                                     [TL_FRAME_ENU] = "enu",
+                                     [TL_FRAME_PROJECTED] = "projected",
+                                     [TL_FRAME_PIXEL] = "pixel",
+                                     NULL};
+
+typedef struct settings {
+    common common;
+    double max_error;
+    bool max_error_given, verify;
+    int frame;
+} settings;
+
+static int report_check(const settings *set, const tl_mesh_report *check)
+{
+    command_say(&set->common,
+                "verified: largest error %.9g at column %lld, row %lld; rms %.4g; %llu samples, %llu uncovered",
+                check->max_error, (long long)check->worst_i, (long long)check->worst_j, check->rms_error,
+                (unsigned long long)check->samples, (unsigned long long)check->uncovered);
+    if (check->max_error <= set->max_error)
+        return EXIT_DONE;
+    complain("the mesh is %.9g from the DEM where %.9g was asked for: this is a fault of talus, please report it",
+             check->max_error, set->max_error);
+    return EXIT_FAILED;
+}
+
+static int write_and_check(const settings *set, const tl_source *dem, const tl_mesh *mesh, const tl_run *run,
+                           progress *bar)
+{
+    tl_error error;
+    tl_mesh_report check = {0};
+    progress_stage(bar, "verifying");
+    if (set->verify && tl_mesh_verify(mesh, dem, run, &check, &error) != TL_OK)
+        return command_failed(bar, &error);
+    progress_end(bar);
+    int status = set->verify ? report_check(set, &check) : EXIT_DONE;
+    if (status != EXIT_DONE)
+        return status;
+    progress_stage(bar, "writing");
+    tl_write_options options = {.overwrite = set->common.overwrite, .frame = (tl_frame)set->frame, .run = run};
+    if (tl_write_mesh(mesh, set->common.output, &options, &error) != TL_OK)
+        return command_failed(bar, &error);
+    progress_end(bar);
+    return EXIT_DONE;
+}
+
+static void report(const settings *set, const tl_source *dem, const tl_framework *framework, const tl_mesh *mesh,
+                   double seconds)
+{
+    double samples = (double)dem->info.width * (double)dem->info.height;
+    command_say(&set->common, "%s: %zu triangles, %zu vertices (%.3g %% of the samples), error <= %g, %.2f s",
+                set->common.output, mesh->triangle_count, mesh->vertex_count,
+                100 * (double)mesh->vertex_count / samples, set->max_error, seconds);
+    size_t isolated = tl_framework_isolated_count(framework);
+    if (isolated)
+        command_say(&set->common, "%zu valid samples lie alone among voids and are in no triangle", isolated);
+}
+
+static int simplify(const settings *set, const char *input)
+{
+    progress bar;
+    tl_error error;
+    tl_run run = command_run(&set->common, &bar);
+    tl_source *dem = tl_open(input, &error);
+    if (!dem)
+        return command_failed(&bar, &error);
+    progress_stage(&bar, "simplifying");
+    tl_framework_options options = {.max_error = set->max_error, .run = &run};
+    tl_framework *framework = tl_framework_build(dem, &options, &error);
+    tl_mesh *mesh = NULL;
+    int status = EXIT_DONE;
+    if (!framework || tl_framework_mesh(framework, &mesh, &error) != TL_OK)
+        status = command_failed(&bar, &error);
+    else {
+        double seconds = progress_end(&bar);
+        status = write_and_check(set, dem, mesh, &run, &bar);
+        if (status == EXIT_DONE)
+            report(set, dem, framework, mesh, seconds);
+    }
+    tl_mesh_destroy(mesh);
+    tl_framework_destroy(framework);
+    tl_source_destroy(dem);
+    return status;
+}
+
+static int run(const command *self, int argc, const char **argv, bool help)
+{
+    settings set = {0};
+    const option shape[] = {
+        {"max-error", 'e', OPTION_NUMBER, &set.max_error, &set.max_error_given, "E",
+         "largest vertical distance of any sample from the mesh, in the DEM's unit, 0...1e30 (needed)", 0, 1e30, NULL},
+        {"verify", 0, OPTION_FLAG, &set.verify, NULL, NULL, "measure the finished mesh against every sample", 0, 0,
+         NULL},
+        {"frame", 0, OPTION_CHOICE, &set.frame, NULL, "FRAME",
+         "coordinates of the mesh (default: enu where the CRS is known)", 0, 0, frames},
+        {0}};
+    const option output[] = {COMMON_OUTPUT(set.common), {0}};
+    const option running[] = {COMMON_RUNNING(set.common), {0}};
+    const option_group groups[] = {{"Simplification", shape}, {"Output", output}, {"Running", running}, {0}};
+    arguments rest;
+    int status;
+    if (!command_begin(self, argc, argv, help, groups, 1, &rest, &status))
+        return status;
+    if (!set.max_error_given) {
+        complain("no error bound given; give --max-error E, in the DEM's unit of height");
+        status = EXIT_USAGE;
+    } else
+        status = command_output_ok(&set.common, false, true) ? simplify(&set, rest.names[0]) : EXIT_USAGE;
+    arguments_free(&rest);
+    return status;
+}
+
+const command command_simplify = {
+    "simplify", "simplify an elevation model to a mesh under a strict error bound", "DEM --max-error E -o MESH",
+    "Formats: .glb, .obj, .ply. Frames: enu is metres east, north and up of the raster's middle;\n"
+    "projected is the DEM's own coordinates; pixel is column, row, height.\n\n"
+    "Example: talus simplify dem.tif --max-error 5 --verify -o mesh.glb",
+    run};

@@ -1,0 +1,109 @@
+#include "cmd/command.h"
+
+#include <errno.h>
+#include <stdarg.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+const char *const progress_names[] = {
+    [PROGRESS_BAR] = "bar", [PROGRESS_JSON] = "json", [PROGRESS_NONE] = "none", [PROGRESS_NONE + 1] = NULL};
+
+static void print_help(const command *self, const option_group *groups)
+{
+    printf("talus %s: %s\n\nUsage: talus %s %s\n", self->name, self->summary, self->name, self->arguments);
+    options_help(groups);
+    if (*self->notes)
+        printf("\n%s\n", self->notes);
+}
+
+bool command_begin(const command *self, int argc, const char **argv, bool help, const option_group *groups, int inputs,
+                   arguments *rest, int *status)
+{
+    *rest = (arguments){0};
+    parse_result result = help ? PARSE_HELP : options_parse(self->name, argc, argv, groups, rest);
+    if (result == PARSE_HELP) {
+        print_help(self, groups);
+        *status = command_done();
+        return false;
+    }
+    if (result == PARSE_OK && inputs >= 0 && rest->count != (size_t)inputs) {
+        if (rest->count > (size_t)inputs)
+            complain("'%s' is one argument too many; the output goes behind -o", rest->names[inputs]);
+        else
+            complain("an input file is missing");
+        result = PARSE_BAD;
+    }
+    if (result == PARSE_BAD) {
+        fprintf(stderr, "Usage: talus %s %s\n'talus help %s' tells more.\n", self->name, self->arguments, self->name);
+        arguments_free(rest);
+        *status = EXIT_USAGE;
+        return false;
+    }
+    return true;
+}
+
+void arguments_free(arguments *rest)
+{
+    for (size_t i = 0; i < rest->count; i++)
+        free((char *)rest->names[i]);
+    free(rest->names);
+    *rest = (arguments){0};
+}
+
+tl_run command_run(const common *options, progress *bar)
+{
+    return progress_run(bar, options->quiet ? PROGRESS_NONE : (progress_style)options->progress,
+                        (unsigned)options->threads);
+}
+
+int command_failed(progress *bar, const tl_error *error)
+{
+    progress_end(bar);
+    complain("%s", error->text);
+    return error->status == TL_ERROR_CANCELLED ? EXIT_INTERRUPTED : EXIT_FAILED;
+}
+
+void command_say(const common *options, const char *format, ...)
+{
+    if (options->quiet)
+        return;
+    va_list list;
+    va_start(list, format);
+    vfprintf(stderr, format, list);
+    va_end(list);
+    fputc('\n', stderr);
+}
+
+int command_done(void)
+{
+    if (fflush(stdout) == 0 && !ferror(stdout))
+        return EXIT_DONE;
+    complain("cannot write to standard output: %s", strerror(errno));
+    return EXIT_FAILED;
+}
+
+static void complain_of_ending(const char *path, bool grid, bool mesh)
+{
+    fprintf(stderr, "talus: %s: the name's ending must be one of", path);
+    const char *separator = " ";
+    for (const tl_format *f = tl_formats(); f->ending; f++)
+        if ((grid && f->grid) || (mesh && f->mesh)) {
+            fprintf(stderr, "%s.%s", separator, f->ending);
+            separator = ", ";
+        }
+    fputc('\n', stderr);
+}
+
+bool command_output_ok(const common *options, bool grid, bool mesh)
+{
+    if (!options->output) {
+        complain("no output named; give -o FILE");
+        return false;
+    }
+    const tl_format *format = tl_format_of(options->output);
+    if (format && ((grid && format->grid) || (mesh && format->mesh)))
+        return true;
+    complain_of_ending(options->output, grid, mesh);
+    return false;
+}

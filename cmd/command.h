@@ -1,0 +1,71 @@
+/* The commands of the program: a table, and what they share. */
+#ifndef CMD_COMMAND_H
+#define CMD_COMMAND_H
+
+#include "cmd/options.h"
+#include "cmd/progress.h"
+#include "lib/talus.h"
+
+typedef struct command {
+    const char *name;
+    const char *summary;   /* one line */
+    const char *arguments; /* what follows the name, as "DEM -o OUTPUT" */
+    const char *notes;     /* a paragraph or example for the help; may be "" */
+    /* argv[0] is the command's name; returns an exit status. With help set, only prints its options. */
+    int (*run)(const struct command *self, int argc, const char **argv, bool help);
+} command;
+
+extern const command command_info, command_simplify, command_synth, command_preview, command_noise;
+
+/* Options that most commands have. */
+typedef struct common {
+    const char *output;
+    bool overwrite, quiet;
+    int64_t threads;
+    int progress; /* index into the names of progress_style */
+} common;
+
+/* The rows of the options in a `common`, for use inside of an array of options. */
+#define COMMON_OUTPUT(c)                                                                                       \
+    {"output", 'o', OPTION_TEXT, &(c).output, NULL, "FILE", "where to write; the ending chooses the format",   \
+     0,        0,   NULL},                                                                                     \
+    {                                                                                                          \
+        "overwrite", 0, OPTION_FLAG, &(c).overwrite, NULL, NULL, "replace the output if it exists", 0, 0, NULL \
+    }
+#define COMMON_RUNNING(c)                                                                                              \
+    {"threads", 't', OPTION_INTEGER, &(c).threads, NULL, "N", "worker threads, 1...512 (default: one a processor)", 1, \
+     512,       NULL},                                                                                                 \
+        {"progress",                                                                                                   \
+         0,                                                                                                            \
+         OPTION_CHOICE,                                                                                                \
+         &(c).progress,                                                                                                \
+         NULL,                                                                                                         \
+         "STYLE",                                                                                                      \
+         "on stderr; a bar only on a terminal (default: bar)",                                                         \
+         0,                                                                                                            \
+         0,                                                                                                            \
+         progress_names},                                                                                              \
+    {                                                                                                                  \
+        "quiet", 'q', OPTION_FLAG, &(c).quiet, NULL, NULL, "print nothing but errors and data", 0, 0, NULL             \
+    }
+
+extern const char *const progress_names[];
+
+/* Parses the command's options and checks that `inputs` file names stand beside them (-1: any number). False: the
+ * caller ends with *status. */
+bool command_begin(const command *self, int argc, const char **argv, bool help, const option_group *groups, int inputs,
+                   arguments *rest, int *status);
+void arguments_free(arguments *rest);
+
+/* The tl_run of a command; reports to *bar. */
+tl_run command_run(const common *options, progress *bar);
+/* Tells the error on stderr; the exit status that it means. */
+int command_failed(progress *bar, const tl_error *error);
+/* A line on stderr, unless quiet. */
+__attribute__((format(printf, 2, 3))) void command_say(const common *options, const char *format, ...);
+/* Flushes stdout; EXIT_DONE, or EXIT_FAILED with a message when it could not be written. */
+int command_done(void);
+/* Whether an output was named and has an ending that talus writes as `grid` or `mesh`; else told. */
+bool command_output_ok(const common *options, bool grid, bool mesh);
+
+#endif

@@ -1,0 +1,61 @@
+/* Options as tables: one row an option gives its parsing, its range check and its line in the help. */
+#ifndef CMD_OPTIONS_H
+#define CMD_OPTIONS_H
+
+#include <stdbool.h>
+#include <stddef.h>
+
+/* Exit statuses, as the man page states them. */
+enum { EXIT_DONE = 0, EXIT_FAILED = 1, EXIT_USAGE = 2, EXIT_INTERRUPTED = 130 };
+
+typedef enum option_kind {
+    OPTION_FLAG,    /* bool: set by its presence */
+    OPTION_INTEGER, /* int64_t */
+    OPTION_NUMBER,  /* double */
+    OPTION_TRIPLE,  /* double[3]: A,B,C */
+    OPTION_TEXT,    /* const char * */
+    OPTION_CHOICE,  /* int: index into `choices` */
+} option_kind;
+
+typedef struct option {
+    const char *name; /* long name, without dashes */
+    char letter;      /* one-letter name, 0: none */
+    option_kind kind;
+    void *target;               /* by kind; untouched when the option is not given */
+    bool *given;                /* set to true when the option is given; NULL: not wanted */
+    const char *argument;       /* what stands for the value in the help, as "METRES"; NULL for flags */
+    const char *help;           /* one line with unit and default */
+    double low, high;           /* of integers and numbers, both included */
+    const char *const *choices; /* names, ended by NULL */
+} option;
+
+/* A group of options under one heading; a list of groups ends with a heading of NULL, a list of options with a name of
+ * NULL. */
+typedef struct option_group {
+    const char *heading;
+    const option *options;
+} option_group;
+
+/* What a command line held beside its options. */
+typedef struct arguments {
+    const char **names; /* owned; each points into argv */
+    size_t count;
+} arguments;
+
+typedef enum parse_result { PARSE_OK, PARSE_HELP, PARSE_BAD } parse_result;
+
+/* Parses argv[1 ...] of the command `command`. Mistakes are told on stderr, with the accepted range and the nearest
+ * name. */
+parse_result options_parse(const char *command, int argc, const char **argv, const option_group *groups,
+                           arguments *rest);
+
+/* Prints every group's options on stdout. */
+void options_help(const option_group *groups);
+
+/* The name nearest to `text` in count names, stride bytes apart (each a const char *); NULL when none is near. */
+const char *nearest_name(const char *text, const void *names, size_t count, size_t stride);
+
+/* "talus: MESSAGE" on stderr. */
+__attribute__((format(printf, 1, 2))) void complain(const char *format, ...);
+
+#endif
