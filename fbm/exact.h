@@ -1,0 +1,29 @@
+/* Exact fractional Brownian surfaces, whole, by circulant embedding: M. L. Stein, "Fast and exact simulation of
+ * fractional Brownian surfaces", J. Comput. Graph. Stat. 11 (2002). */
+#ifndef FBM_EXACT_H
+#define FBM_EXACT_H
+
+#include <stddef.h>
+#include <stdint.h>
+
+typedef enum fbm_status {
+    FBM_OK = 0,
+    FBM_NO_MEMORY, /* the system refused the memory that fbm_exact_memory states */
+    FBM_TOO_LARGE, /* the size is beyond FBM_EXACT_SIZE_MAX or cannot be addressed */
+} fbm_status;
+
+/* Largest side: above it the spectrum alone takes more than 10 GB, and the single-precision transform more error than
+ * the field's smallest increments can bear. */
+#define FBM_EXACT_SIZE_MAX 16384
+
+/* Bytes that fbm_exact allocates at its peak, without the output; 0 for sizes that it refuses. About 31 n^2 for
+ * hurst <= 0.75, 88 n^2 above. */
+size_t fbm_exact_memory(size_t size, double hurst);
+
+/* Writes a size x size field to out[size * size], with Gaussian increments of mean 0 and
+ * E|Z(x + h) - Z(x)|^2 = delta^2 |h|^(2H), h in samples, for every pair of samples. Z is 0 at the first sample.
+ *
+ * hurst is clamped to [0.01, 0.99]; size >= 1. On failure out is untouched. */
+fbm_status fbm_exact(size_t size, double hurst, double delta, uint64_t seed, float *out);
+
+#endif

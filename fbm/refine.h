@@ -1,0 +1,74 @@
+/* Refinement of a lattice of heights by one level: every cell is halved in both directions.
+ *
+ * A level takes two half steps: first the centres of the cells, then the middles of their edges, which see the centres.
+ * Vertex (i, j) of level l is vertex (2i, 2j) of level l + 1 and keeps its height, bit for bit. Noise is keyed by the
+ * lattice coordinates of the new vertices, and every sum is taken in the same order wherever the window lies, so that
+ * any window of a level, made alone, has the bits of the whole, on every instruction set.
+ *
+ * The functions are pure: the caller's memory, no allocation, no failure; contracts are asserted. */
+#ifndef FBM_REFINE_H
+#define FBM_REFINE_H
+
+#include "fbm/weights.h"
+
+#include <stddef.h>
+#include <stdint.h>
+
+/* A rectangle of a lattice, and how it lies in memory: sample (i + x, j + y) is at [y * stride + x]. */
+typedef struct fbm_window {
+    int64_t i, j;         /* lattice coordinates of the first sample; |i|, |j| < 2^61 */
+    size_t width, height; /* samples */
+    size_t stride;        /* floats between the beginnings of rows, >= width */
+} fbm_window;
+
+/* A rule of refinement, found by name. */
+typedef struct fbm_scheme {
+    const char *name;    /* "stationary" */
+    const char *summary; /* one line */
+    /* Coefficients for a Hurst exponent (clamped to FBM_HURST_MIN ... FBM_HURST_MAX). */
+    void (*weights)(double hurst, fbm_weights *out);
+    int margin; /* cells of level l that fbm_refine needs beyond the output on every side: see fbm_refine_support */
+    int centre_before; /* the centre of cell (i, j) needs samples i - centre_before ... */
+    int centre_after;  /* ... i + centre_after, likewise for rows */
+    int rule;          /* which row functions; private */
+} fbm_scheme;
+
+/* The schemes, ended by an entry whose name is NULL. The first is the default. */
+extern const fbm_scheme fbm_schemes[];
+/* NULL where there is none of this name. */
+const fbm_scheme *fbm_scheme_find(const char *name);
+
+/* One step, from level `level` to level + 1. */
+typedef struct fbm_step {
+    const fbm_scheme *scheme;
+    fbm_weights weights; /* by scheme->weights; may be scaled or replaced by the caller */
+    /* Factor on all noise. For fBm with E|Z(x+h) - Z(x)|^2 = delta^2 |h|^(2H) and the input's spacing s in units of h
+     * it is delta s^H; a measured schedule may give any other. 0: no noise is made, the surface is smooth. */
+    float amplitude;
+    uint64_t seed;
+    int32_t level; /* of the input; a key of the noise, nothing else */
+} fbm_step;
+
+/* The smallest input window of level l from which fbm_refine makes the window `out` of level l + 1: all samples within
+ * scheme->margin cells of a point of the output. `stride` of the result is its width. */
+fbm_window fbm_refine_support(const fbm_scheme *scheme, fbm_window out);
+/* The same for fbm_centres; `cells` as there. */
+fbm_window fbm_centres_support(const fbm_scheme *scheme, fbm_window cells);
+
+/* Floats of scratch that fbm_refine needs for an output of this width; fbm_centres for width / 2. 0 on overflow.
+ * It does not depend on the height. */
+size_t fbm_refine_scratch(size_t width);
+
+/* Makes the window `out_window` of level step->level + 1, in coordinates of that level (odd ones are good), from a
+ * window of level step->level that holds fbm_refine_support(). in, out and scratch must not overlap. A NaN in the input
+ * spreads to the new samples that see it. */
+void fbm_refine(const fbm_step *step, const float *in, fbm_window in_window, float *out, fbm_window out_window,
+                float *scratch);
+
+/* Only the first half step: the centres of the cells `cells`, where cell (i, j) has its centre at (i + 1/2, j + 1/2) of
+ * level step->level. Equal, bit for bit, to the samples (2i + 1, 2j + 1) that fbm_refine makes. `scratch` as for an
+ * output twice as wide. */
+void fbm_centres(const fbm_step *step, const float *in, fbm_window in_window, float *out, fbm_window cells,
+                 float *scratch);
+
+#endif
