@@ -49,8 +49,10 @@ typedef struct fbm_step {
     int32_t level; /* of the input; a key of the noise, nothing else */
 } fbm_step;
 
-/* The smallest input window of level l from which fbm_refine makes the window `out` of level l + 1: all samples within
- * scheme->margin cells of a point of the output. `stride` of the result is its width. */
+/* The input window of level l from which fbm_refine makes the window `out` of level l + 1: from column
+ * floor(out.i / 2) - margin to floor((out.i + out.width - 1) / 2) + margin, likewise for rows, so that a halo of h
+ * samples around the output asks for one of ceil(h / 2) + margin around the input. `stride` of the result is its width.
+ */
 fbm_window fbm_refine_support(const fbm_scheme *scheme, fbm_window out);
 /* The same for fbm_centres; `cells` as there. */
 fbm_window fbm_centres_support(const fbm_scheme *scheme, fbm_window cells);

@@ -1,0 +1,54 @@
+/* Row functions of the refinement, built once an instruction set. Private to fbm and its tests. */
+#ifndef FBM_KERNEL_H
+#define FBM_KERNEL_H
+
+#include "fbm/refine.h"
+#include "fbm/rng.h"
+
+/* Every row pointer of a job points to the first column named with it; rows are read only where stated, `count` being
+ * the number of points to make. `g` and `other` hold noise, or NULL where none is to be added. Coefficients are ready
+ * to use: the taps hold the amplitude. */
+typedef struct fbm_centre_job {
+    const float *z[6]; /* rows j - 2 ... j + 3, from column i - 2: count + 5 */
+    const float *g[3]; /* centre noise of rows j - 1 ... j + 1, from column i - 1: count + 2 */
+    float w[4], t[3];
+    float *partial[5]; /* scratch rows of count + 5 */
+    float *out;        /* count centres from column i */
+} fbm_centre_job;
+
+/* Edges of one orientation lie between samples of two lattices: `side`, whose columns are half a cell off the edge's
+ * (for an edge along a row: the vertices), and `same`, in the columns of the edges (then: the centres). */
+typedef struct fbm_edge_job {
+    const float *side[3];  /* rows -1, 0, +1 about the edge, from 3/2 cells before it: count + 3 */
+    const float *same[4];  /* rows -3/2, -1/2, +1/2, +3/2, from 1 cell before: count + 2 */
+    const float *g[3];     /* noise of this orientation, rows -1, 0, +1, from 1 cell before: count + 2 */
+    const float *other[2]; /* noise of the other one, rows -1/2, +1/2, from 3/2 cells before: count + 3 */
+    float w[4], t[3];
+    float *partial[4]; /* scratch rows of count + 3 */
+    float *out;        /* count edges */
+} fbm_edge_job;
+
+typedef struct fbm_kernel {
+    const char *name; /* "avx2" */
+    void (*noise)(uint64_t seed, int32_t level, fbm_noise_kind kind, int64_t row, int64_t first, size_t count,
+                  float *out);
+    void (*centres)(const fbm_centre_job *job, size_t count);
+    void (*edges)(const fbm_edge_job *job, size_t count);
+    /* out[x] = (a[x] + b[x]) / 2 + t g[x]; g may be NULL */
+    void (*mean2)(const float *a, const float *b, const float *g, float t, float *out, size_t count);
+    /* the same of the 4 corners (a[x], a[x + 1], b[x], b[x + 1]) */
+    void (*mean4)(const float *a, const float *b, const float *g, float t, float *out, size_t count);
+    /* out[2x] = even[x], out[2x + 1] = odd[x] */
+    void (*interleave)(const float *even, const float *odd, float *out, size_t count);
+} fbm_kernel;
+
+/* The kernels that were built and that this processor runs, best first, ended by NULL; the last is the portable one. */
+const fbm_kernel *const *fbm_kernels(void);
+
+/* fbm_refine, fbm_centres and fbm_noise_row with a kernel of the caller's choice. */
+void fbm_refine_by(const fbm_kernel *kernel, const fbm_step *step, const float *in, fbm_window in_window, float *out,
+                   fbm_window out_window, float *scratch);
+void fbm_centres_by(const fbm_kernel *kernel, const fbm_step *step, const float *in, fbm_window in_window, float *out,
+                    fbm_window cells, float *scratch);
+
+#endif

@@ -1,0 +1,51 @@
+/* Which kernels this processor runs, found once. */
+#include "fbm/kernel.h"
+
+#include <stdatomic.h>
+
+extern const fbm_kernel fbm_kernel_plain;
+#ifdef FBM_HAVE_AVX2
+extern const fbm_kernel fbm_kernel_avx2;
+#endif
+#ifdef FBM_HAVE_AVX512
+extern const fbm_kernel fbm_kernel_avx512;
+#endif
+
+static const fbm_kernel *const all[] = {
+#ifdef FBM_HAVE_AVX512
+    &fbm_kernel_avx512,
+#endif
+#ifdef FBM_HAVE_AVX2
+    &fbm_kernel_avx2,
+#endif
+    &fbm_kernel_plain,
+    NULL,
+};
+
+/* Index of the first entry of `all` that runs here. Every processor that runs one entry runs those behind it. */
+static size_t find_best(void)
+{
+    size_t best = 0;
+#ifdef FBM_HAVE_AVX512
+    if (!(__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512vl") &&
+          __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512dq")))
+        best++;
+#endif
+#ifdef FBM_HAVE_AVX2
+    if (!__builtin_cpu_supports("avx2"))
+        best = sizeof all / sizeof *all - 2;
+#endif
+    return best;
+}
+
+const fbm_kernel *const *fbm_kernels(void)
+{
+    /* Threads that race here store the same value. */
+    static atomic_size_t chosen; /* 0: not yet; else the index + 1 */
+    size_t index = atomic_load_explicit(&chosen, memory_order_relaxed);
+    if (!index) {
+        index = find_best() + 1;
+        atomic_store_explicit(&chosen, index, memory_order_relaxed);
+    }
+    return all + (index - 1);
+}
