@@ -12,12 +12,11 @@ typedef enum fbm_status {
     FBM_TOO_LARGE, /* the size is beyond FBM_EXACT_SIZE_MAX or cannot be addressed */
 } fbm_status;
 
-/* Largest side: above it the spectrum alone takes more than 10 GB, and the single-precision transform more error than
- * the field's smallest increments can bear. */
+/* Largest side, for which fbm_exact takes 10 GB (hurst <= 0.75) or 30 GB. */
 #define FBM_EXACT_SIZE_MAX 16384
 
-/* Bytes that fbm_exact allocates at its peak, without the output; 0 for sizes that it refuses. About 31 n^2 for
- * hurst <= 0.75, 88 n^2 above. */
+/* Bytes that fbm_exact allocates at its peak, without the output; 0 for sizes that it refuses. About 39 n^2 for
+ * hurst <= 0.75, 110 n^2 above. */
 size_t fbm_exact_memory(size_t size, double hurst);
 
 /* Writes a size x size field to out[size * size], with Gaussian increments of mean 0 and
