@@ -63,10 +63,20 @@ tl_status tl_run_check(const tl_run *run, tl_error *error)
     return cancelled(run) ? tl_fail(error, TL_ERROR_CANCELLED, "interrupted") : TL_OK;
 }
 
+/* Whether a new failure tells more than the one on record: a cause more than an item that gave up, then the first item.
+ */
+static bool tells_more(const tl_parallel *loop, uint64_t item, const tl_error *error)
+{
+    bool old_gave_up = loop->failure.status == TL_ERROR_CANCELLED, new_gave_up = error->status == TL_ERROR_CANCELLED;
+    if (loop->failure.status == TL_OK || old_gave_up != new_gave_up)
+        return loop->failure.status == TL_OK || old_gave_up;
+    return item < loop->failed_item;
+}
+
 static void record_failure(tl_parallel *loop, uint64_t item, const tl_error *error)
 {
     pthread_mutex_lock(&loop->lock);
-    if (loop->failure.status == TL_OK || item < loop->failed_item) {
+    if (tells_more(loop, item, error)) {
         loop->failure = *error;
         loop->failed_item = item;
     }

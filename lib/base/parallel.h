@@ -8,7 +8,8 @@ typedef struct tl_parallel tl_parallel;
 
 /* One item of a loop. `worker` is below the number that tl_parallel_workers gives: index per-worker scratch with it.
  * Outputs of different items must be disjoint. A failure ends the loop, and the first by item index among those that
- * ran is what tl_parallel_for reports. */
+ * ran is what tl_parallel_for reports; an item that only gave up (see tl_parallel_wait_turn) returns
+ * TL_ERROR_CANCELLED. */
 typedef tl_status (*tl_parallel_item)(void *context, tl_parallel *loop, uint64_t item, unsigned worker,
                                       tl_error *error);
 
@@ -22,7 +23,8 @@ tl_status tl_parallel_for(const tl_run *run, uint64_t items, uint64_t samples, t
                           tl_error *error);
 
 /* Inside of an item: waits until every smaller item has passed its turn. False: the loop has failed or was
- * cancelled, give up. Between this and tl_parallel_end_turn at most one item of the loop runs, in order of items. */
+ * cancelled, give up. A failing item keeps its turn, so that nobody goes on behind it. Between this and
+ * tl_parallel_end_turn at most one item of the loop runs, in order of items. */
 bool tl_parallel_wait_turn(tl_parallel *loop, uint64_t item);
 void tl_parallel_end_turn(tl_parallel *loop, uint64_t item);
 

@@ -1,0 +1,173 @@
+#include "fbm/estimate.h"
+
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+
+/* Weights of the mean-exact prediction; d1 + 2 d2 + 3 d3 = 1/8 makes it exact for planes. */
+enum { REACH = 3 };
+static const double slope_weights[REACH + 1] = {0, .22405, -.06762, .01206};
+
+/* Share of white noise's variance that the three details keep together. A detail of the children keeps 1/4. A mean of
+ * four has 1/4 of the noise, and its slope, q = 2 (d1^2 + d2^2 + d3^2) of that; the prediction touches no child of the
+ * block itself, so variances add: (1 + q)/4 for x and for y, (1 + q^2)/4 for the mixed one. */
+static const double slope_gain = 2 * (.22405 * .22405 + .06762 * .06762 + .01206 * .01206);
+
+static double noise_share(void)
+{
+    return 0.5 * (1 + slope_gain) + 0.25 * (1 + slope_gain * slope_gain);
+}
+
+/* Means of 2 x 2 samples at distance `step`, each at its block's first sample; the last `step` columns and rows have
+ * none. */
+static void block_means(const float *in, size_t width, size_t height, size_t step, float *out)
+{
+    for (size_t y = 0; y + step < height; y++) {
+        const float *a = in + y * width, *b = a + step * width;
+        for (size_t x = 0; x + step < width; x++)
+            out[y * width + x] = 0.25f * ((a[x] + a[x + step]) + (b[x] + b[x + step]));
+    }
+}
+
+/* D along a stride: the predicted half difference of the children. */
+static double slope(const float *mean, ptrdiff_t stride)
+{
+    double sum = 0;
+    for (int k = 1; k <= REACH; k++)
+        sum += slope_weights[k] * ((double)mean[k * stride] - (double)mean[-k * stride]);
+    return sum;
+}
+
+/* D along rows of D along columns. */
+static double cross_slope(const float *mean, ptrdiff_t dx, ptrdiff_t dy)
+{
+    double sum = 0;
+    for (int k = 1; k <= REACH; k++)
+        sum += slope_weights[k] * (slope(mean + k * dy, dx) - slope(mean - k * dy, dx));
+    return sum;
+}
+
+static void add_block(const float *child, const float *mean, size_t width, size_t step, fbm_detail *detail)
+{
+    ptrdiff_t dx = (ptrdiff_t)step, dy = (ptrdiff_t)(step * width);
+    double a = (double)child[0], b = (double)child[dx], c = (double)child[dy], d = (double)child[dx + dy];
+    double x = 0.25 * ((b - a) + (d - c)) - slope(mean, 2 * dx);
+    double y = 0.25 * ((c - a) + (d - b)) - slope(mean, 2 * dy);
+    double mixed = 0.25 * ((a - b) + (d - c)) - cross_slope(mean, 2 * dx, 2 * dy);
+    double sum = x * x + y * y + mixed * mixed;
+    if (!isfinite(sum)) /* a void in the support */
+        return;
+    detail->x += x * x;
+    detail->y += y * y;
+    detail->mixed += mixed * mixed;
+    detail->count++;
+}
+
+static void add_octave(const float *children, const float *means, size_t width, size_t height, size_t step,
+                       const size_t box[4], fbm_detail *detail)
+{
+    size_t before = 2 * REACH * step, after = (2 * REACH + 1) * step;
+    for (size_t y = box[1]; y < box[3]; y++)
+        for (size_t x = box[0]; x < box[2]; x++)
+            if (x >= before && y >= before && x + after < width && y + after < height)
+                add_block(children + y * width + x, means + y * width + x, width, step, detail);
+}
+
+void fbm_detail_add(const float *heights, size_t width, size_t height, size_t x0, size_t y0, size_t x1, size_t y1,
+                    float *scratch, fbm_detail octaves[2])
+{
+    const size_t box[4] = {x0, y0, x1, y1};
+    float *means = scratch, *means_of_means = scratch + width * height;
+    block_means(heights, width, height, 1, means);
+    add_octave(heights, means, width, height, 1, box, &octaves[0]);
+    if (width < 2 || height < 2)
+        return;
+    /* what block_means leaves unset at the rim must not look like heights */
+    for (size_t y = 0; y < height; y++)
+        means[y * width + width - 1] = NAN;
+    for (size_t x = 0; x < width; x++)
+        means[(height - 1) * width + x] = NAN;
+    block_means(means, width, height, 2, means_of_means);
+    add_octave(means, means_of_means, width, height, 2, box, &octaves[1]);
+}
+
+double fbm_detail_variance(const fbm_detail *detail, int octave, double noise)
+{
+    if (!detail->count)
+        return 0;
+    double raw = (detail->x + detail->y + detail->mixed) / (double)detail->count;
+    double share = noise * noise_share() * (octave ? 0.25 : 1); /* a mean of four has a quarter of the noise */
+    return raw - share > 0.25 * raw ? raw - share : 0.25 * raw;
+}
+
+/* ---- the same for fBm ---- */
+
+enum { WIDE = 2 * (2 * REACH + 1), CELL_STEPS = 16 };
+
+/* One-dimensional stencils over the WIDE children about a block, whose own are at 2 REACH and 2 REACH + 1. */
+typedef struct stencils {
+    double mean[WIDE];  /* the block's mean */
+    double haar[WIDE];  /* half the difference of its children */
+    double slope[WIDE]; /* the predicted half difference */
+} stencils;
+
+static stencils make_stencils(void)
+{
+    stencils s;
+    memset(&s, 0, sizeof s);
+    const int own = 2 * REACH;
+    s.mean[own] = s.mean[own + 1] = 0.5;
+    s.haar[own] = -0.5;
+    s.haar[own + 1] = 0.5;
+    for (int k = 1; k <= REACH; k++)
+        for (int child = 0; child < 2; child++) {
+            s.slope[own + 2 * k + child] += 0.5 * slope_weights[k];
+            s.slope[own - 2 * k + child] -= 0.5 * slope_weights[k];
+        }
+    return s;
+}
+
+/* -1/2 E|x - y|^(2H) for two samples at a lag in children's cells, in units of the parents' distance. */
+static double covariance(int i, int j, double hurst, bool area)
+{
+    if (!area)
+        return -0.5 * pow(0.5 * hypot(i, j), 2 * hurst);
+    /* the difference of two uniform points of unit cells has the triangular density 1 - |u| */
+    double sum = 0, weight = 0;
+    for (int a = 0; a < CELL_STEPS; a++)
+        for (int b = 0; b < CELL_STEPS; b++) {
+            double u = 2 * (a + 0.5) / CELL_STEPS - 1, v = 2 * (b + 0.5) / CELL_STEPS - 1;
+            double w = (1 - fabs(u)) * (1 - fabs(v));
+            sum += w * pow(0.25 * ((i + u) * (i + u) + (j + v) * (j + v)), hurst);
+            weight += w;
+        }
+    return -0.5 * sum / weight;
+}
+
+/* Variance of the detail with row stencil `fx` and column stencil `fy`, minus the prediction of the same kind. */
+static double detail_variance(const double covariances[WIDE][WIDE], const double haar_x[WIDE],
+                              const double haar_y[WIDE], const double slope_x[WIDE], const double slope_y[WIDE])
+{
+    double weights[WIDE][WIDE], sum = 0;
+    for (int y = 0; y < WIDE; y++)
+        for (int x = 0; x < WIDE; x++)
+            weights[y][x] = haar_y[y] * haar_x[x] - slope_y[y] * slope_x[x];
+    for (int y = 0; y < WIDE; y++)
+        for (int x = 0; x < WIDE; x++)
+            for (int v = 0; v < WIDE; v++)
+                for (int u = 0; u < WIDE; u++)
+                    sum += weights[y][x] * weights[v][u] * covariances[abs(y - v)][abs(x - u)];
+    return sum;
+}
+
+double fbm_detail_of_fbm(double hurst, bool area)
+{
+    double covariances[WIDE][WIDE];
+    for (int j = 0; j < WIDE; j++)
+        for (int i = j; i < WIDE; i++)
+            covariances[j][i] = covariances[i][j] = covariance(i, j, hurst, area);
+    const stencils s = make_stencils();
+    /* x and y alike; the mixed detail's prediction is the product of the slopes */
+    return 2 * detail_variance(covariances, s.haar, s.mean, s.slope, s.mean) +
+           detail_variance(covariances, s.haar, s.haar, s.slope, s.slope);
+}

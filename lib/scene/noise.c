@@ -1,0 +1,140 @@
+/* A fractional Brownian surface as a source: an exact coarse field, refined. */
+#include "fbm/exact.h"
+#include "lib/base/error.h"
+#include "lib/base/georef.h"
+#include "lib/base/size.h"
+#include "lib/scene/chain.h"
+
+#include <assert.h>
+#include <math.h>
+#include <stdio.h>
+#include <string.h>
+
+enum {
+    COARSE_CELLS = 256, /* cells on a side of the exact field, at most */
+    HALO = 8,           /* coarse samples beyond it that refinement can see; converges to this (see chain) */
+    BLOCK = 512,
+    PARAMETERS = 6,
+    TEXT_LIMIT = 64,
+};
+
+typedef struct noise {
+    tl_source source;
+    scene_chain chain;
+    int levels;   /* refinements of the exact field */
+    int64_t side; /* of the exact field, halo included */
+    float *exact;
+    tl_parameter parameters[PARAMETERS];
+    char texts[PARAMETERS][TEXT_LIMIT];
+} noise;
+
+static tl_status load(void *context, fbm_window window, float *buffer, tl_error *error)
+{
+    (void)error;
+    const noise *n = context;
+    int64_t i = window.i + HALO, j = window.j + HALO;
+    assert(i >= 0 && j >= 0 && i + (int64_t)window.width <= n->side && j + (int64_t)window.height <= n->side);
+    for (size_t row = 0; row < window.height; row++)
+        memcpy(buffer + row * window.width, n->exact + (j + (int64_t)row) * n->side + i, window.width * sizeof *buffer);
+    return TL_OK;
+}
+
+static tl_status noise_read(const tl_source *self, int level, tl_window window, float *out, tl_error *error)
+{
+    (void)level;
+    const noise *n = (const noise *)self;
+    tl_status status = TL_OK;
+    for (int64_t y = 0; y < window.height && status == TL_OK; y += BLOCK)
+        for (int64_t x = 0; x < window.width && status == TL_OK; x += BLOCK) {
+            size_t width = (size_t)tl_int64_min(BLOCK, window.width - x),
+                   height = (size_t)tl_int64_min(BLOCK, window.height - y);
+            scene_chain_target target = {.level = n->levels,
+                                         .window = {window.x + x, window.y + y, width, height, (size_t)window.width},
+                                         .out = out + y * window.width + x};
+            status = scene_chain_run(&n->chain, &target, load, (void *)n, self->info.name, error);
+        }
+    return status;
+}
+
+static void noise_destroy(tl_source *self)
+{
+    free(((noise *)self)->exact);
+    free(self);
+}
+
+static tl_status check(const tl_noise_options *o, tl_error *error)
+{
+    if (o->size < 1 || o->size > INT64_C(1) << 30)
+        return tl_fail(error, TL_ERROR_ARGUMENT, "the size must be from 1 to 2^30 samples, not %lld",
+                       (long long)o->size);
+    if (!(o->hurst > 0 && o->hurst < 1))
+        return tl_fail(error, TL_ERROR_ARGUMENT, "the Hurst exponent must lie between 0 and 1, not at %g", o->hurst);
+    if (!(o->delta >= 0 && o->delta <= 1e30))
+        return tl_fail(error, TL_ERROR_ARGUMENT, "delta must be from 0 to 1e30, not %g", o->delta);
+    return TL_OK;
+}
+
+static tl_status make_exact(noise *n, const tl_noise_options *o, tl_error *error)
+{
+    n->exact = tl_alloc_grid(n->side, n->side, sizeof *n->exact);
+    double delta = o->delta * exp2(o->hurst * n->levels); /* over one coarse sample */
+    fbm_status status = n->exact ? fbm_exact((size_t)n->side, o->hurst, delta, o->seed, n->exact) : FBM_NO_MEMORY;
+    return status == FBM_OK ? TL_OK : tl_fail_memory(error, "the exact coarse field");
+}
+
+static void note(noise *n, const char *name, const char *text)
+{
+    size_t k = n->source.info.parameter_count++;
+    snprintf(n->texts[k], TEXT_LIMIT, "%s", text);
+    n->parameters[k] = (tl_parameter){.name = name, .value = n->texts[k]};
+}
+
+static void note_all(noise *n, const tl_noise_options *o, const fbm_scheme *scheme)
+{
+    char text[TEXT_LIMIT];
+    note(n, "version", tl_version());
+    note(n, "input", "noise");
+    note(n, "scheme", scheme->name);
+    snprintf(text, sizeof text, "%llu", (unsigned long long)o->seed);
+    note(n, "seed", text);
+    snprintf(text, sizeof text, "%.17g", o->hurst);
+    note(n, "hurst", text);
+    snprintf(text, sizeof text, "%.17g", o->delta);
+    note(n, "delta", text);
+    n->source.info.parameters = n->parameters;
+}
+
+tl_source *tl_noise_create(const tl_noise_options *o, tl_error *error)
+{
+    const fbm_scheme *scheme = scene_scheme(o->scheme, error);
+    if (!scheme || check(o, error) != TL_OK)
+        return NULL;
+    noise *n = calloc(1, sizeof *n);
+    if (!n) {
+        tl_fail_memory(error, "the noise");
+        return NULL;
+    }
+    while (((o->size - 1) >> n->levels) > COARSE_CELLS)
+        n->levels++;
+    n->side = tl_div_up(o->size - 1, INT64_C(1) << n->levels) + 1 + 2 * HALO;
+    n->source = (tl_source){.info = {.width = o->size,
+                                     .height = o->size,
+                                     .type = TL_RASTER_POINT,
+                                     .georef = tl_georef_none(),
+                                     .name = "noise"},
+                            .read = noise_read,
+                            .destroy = noise_destroy};
+    for (int l = 0; l < n->levels; l++) {
+        fbm_step *step = &n->chain.steps[l];
+        /* the finest step is always level -1, so that a larger surface is another one, but of the same kind */
+        *step = (fbm_step){.scheme = scheme, .seed = o->seed, .level = l - n->levels};
+        scheme->weights(o->hurst, &step->weights);
+        step->amplitude = (float)(o->delta * exp2(o->hurst * (n->levels - l)));
+    }
+    note_all(n, o, scheme);
+    if (make_exact(n, o, error) != TL_OK) {
+        noise_destroy(&n->source);
+        return NULL;
+    }
+    return &n->source;
+}

@@ -1,0 +1,109 @@
+#include "lib/scene/roughness.h"
+
+#include "fbm/estimate.h"
+#include "lib/base/error.h"
+#include "lib/base/parallel.h"
+#include "lib/base/size.h"
+
+#include <math.h>
+#include <string.h>
+
+enum {
+    BLOCK = 512,
+    MARGIN = FBM_DETAIL_BEFORE + FBM_DETAIL_AFTER,
+    MIN_BLOCKS = 64, /* fewer overlapping 2 x 2 blocks than this say nothing of a variance */
+};
+
+typedef struct measurement {
+    const tl_source *dem;
+    int64_t columns;
+    fbm_detail (*sums)[2]; /* one pair a block of the raster, so that the order of adding is fixed */
+} measurement;
+
+static tl_status measure_block(void *context, tl_parallel *loop, uint64_t item, unsigned worker, tl_error *error)
+{
+    (void)loop;
+    (void)worker;
+    const measurement *m = context;
+    const tl_source_info *info = &m->dem->info;
+    int64_t x = (int64_t)item % m->columns * BLOCK, y = (int64_t)item / m->columns * BLOCK;
+    int64_t x0 = tl_int64_max(0, x - FBM_DETAIL_BEFORE), x1 = tl_int64_min(info->width, x + BLOCK + FBM_DETAIL_AFTER);
+    int64_t y0 = tl_int64_max(0, y - FBM_DETAIL_BEFORE), y1 = tl_int64_min(info->height, y + BLOCK + FBM_DETAIL_AFTER);
+    tl_window window = {x0, y0, x1 - x0, y1 - y0};
+    size_t samples = (size_t)(window.width * window.height);
+    float *heights = tl_alloc(samples, 3 * sizeof *heights);
+    if (!heights)
+        return tl_fail_memory(error, info->name);
+    tl_status status = tl_source_read(m->dem, info->level, window, heights, error);
+    if (status == TL_OK)
+        fbm_detail_add(heights, (size_t)window.width, (size_t)window.height, (size_t)(x - x0), (size_t)(y - y0),
+                       (size_t)(tl_int64_min(x + BLOCK, info->width) - x0),
+                       (size_t)(tl_int64_min(y + BLOCK, info->height) - y0), heights + samples, m->sums[item]);
+    free(heights);
+    return status;
+}
+
+static void add(fbm_detail *sum, const fbm_detail *part)
+{
+    sum->x += part->x;
+    sum->y += part->y;
+    sum->mixed += part->mixed;
+    sum->count += part->count;
+}
+
+static tl_roughness conclude(const fbm_detail octaves[2], double quantum)
+{
+    tl_roughness result = {0};
+    if (octaves[0].count < MIN_BLOCKS || octaves[1].count < MIN_BLOCKS)
+        return result;
+    double noise = quantum * quantum / 12;
+    double finest = sqrt(fbm_detail_variance(&octaves[0], 0, noise)),
+           next = sqrt(fbm_detail_variance(&octaves[1], 1, noise));
+    if (!(finest > 0) || !(next > 0) || !isfinite(finest) || !isfinite(next))
+        return result;
+    result.measurable = true;
+    result.sigma = finest;
+    result.hurst = log2(next / finest);
+    return result;
+}
+
+tl_status tl_roughness_measure(const tl_source *dem, const tl_run *run, tl_roughness *out, tl_error *error)
+{
+    const tl_source_info *info = &dem->info;
+    measurement m = {.dem = dem, .columns = tl_div_up(info->width, BLOCK)};
+    int64_t blocks = m.columns * tl_div_up(info->height, BLOCK);
+    m.sums = calloc((size_t)blocks, sizeof *m.sums);
+    if (!m.sums)
+        return tl_fail_memory(error, info->name);
+    uint64_t samples = (uint64_t)info->width * (uint64_t)info->height;
+    tl_status status = tl_parallel_for(run, (uint64_t)blocks, samples, measure_block, &m, error);
+    if (status == TL_OK) {
+        fbm_detail octaves[2] = {{0}, {0}};
+        for (int64_t i = 0; i < blocks; i++)
+            for (int k = 0; k < 2; k++)
+                add(&octaves[k], &m.sums[i][k]);
+        *out = conclude(octaves, info->quantum);
+    }
+    free(m.sums);
+    return status;
+}
+
+void scene_predict_octaves(const tl_roughness *measured, const tl_georef *georef, scene_octave *octaves, int count)
+{
+    if (!measured->measurable) {
+        memset(octaves, 0, (size_t)count * sizeof *octaves);
+        for (int j = 0; j < count; j++)
+            octaves[j].hurst = 1;
+        return;
+    }
+    double hurst = measured->hurst, sigma = measured->sigma;
+    /* the measured octave's parents are two samples apart; ratios are those of metres to metres */
+    double parent = 2 * sqrt(georef->cell_x * georef->cell_y);
+    double ratio = log2(sigma * georef->height_unit / parent);
+    for (int j = 0; j < count; j++) {
+        hurst += .276 * (1.191 + .266 * (ratio + 5) - hurst);
+        sigma *= exp2(-hurst);
+        ratio += 1 - hurst;
+        octaves[j] = (scene_octave){.sigma = sigma, .hurst = hurst};
+    }
+}

@@ -1,0 +1,18 @@
+/* How rough an elevation model is, and how rough it may be expected to be below its samples. */
+#ifndef SCENE_ROUGHNESS_H
+#define SCENE_ROUGHNESS_H
+
+#include "lib/talus.h"
+
+/* The detail of one octave below the samples. */
+typedef struct scene_octave {
+    double sigma; /* standard deviation of the detail, units of height */
+    double hurst; /* local exponent: this octave's sigma is 2^-hurst of the one before; may exceed 1 */
+} scene_octave;
+
+/* Predicts the octaves 0 ... count - 1 below a raster (octave 0 has the raster's own cells as parents) from what was
+ * measured: exponents are drawn, octave by octave, to what 35 real elevation models have at that ratio of detail to
+ * cell. cell_x, cell_y: metres; height_unit: metres. */
+void scene_predict_octaves(const tl_roughness *measured, const tl_georef *georef, scene_octave *octaves, int count);
+
+#endif
