@@ -8,12 +8,15 @@ struct tiff; /* libtiff's TIFF */
 
 /* The CRS of an open GeoTIFF, with one reference; *out is NULL where the file has none. The keys are kept in it. */
 tl_status dem_crs_from_tiff(struct tiff *tiff, const char *path, tl_crs **out, tl_error *error);
+/* The same, and what the file's coordinates must be multiplied by to be those of the CRS: 1, unless it is geographic
+ * and the file's angles are not in degrees. */
+tl_status dem_crs_from_tiff_scaled(struct tiff *tiff, const char *path, tl_crs **out, double *scale, tl_error *error);
 /* The CRS of a WKT text (any version), "EPSG:CODE" or a PROJ string; `path` names the file that it is from in messages.
  */
 tl_status dem_crs_from_text(const char *text, const char *path, tl_crs **out, tl_error *error);
 
-/* From coordinates of a CRS to longitude and latitude in degrees on its own datum. Thread-safe as long as each thread
- * has its own. */
+/* From coordinates of a CRS to longitude (east of its own prime meridian) and latitude in degrees on its own datum.
+ * Thread-safe as long as each thread has its own. */
 typedef struct dem_projection dem_projection;
 dem_projection *dem_projection_create(const tl_crs *crs, tl_error *error);
 void dem_projection_destroy(dem_projection *projection);
@@ -30,7 +33,8 @@ void dem_local_frame_forward(const dem_local_frame *frame, double longitude, dou
                              double xyz[3]);
 
 /* Fills in cell_x and cell_y of `georef`, whose crs, located and transform are set, for a raster of width x height
- * samples. */
+ * samples. Where the transform puts the raster's middle beyond a pole, so that its angles cannot be meant, a degree
+ * counts as a metre, as units of an unknown CRS do; a raster that is not located has cells of 1. */
 tl_status dem_georef_measure(tl_georef *georef, int64_t width, int64_t height, tl_error *error);
 
 #endif

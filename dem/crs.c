@@ -1,0 +1,154 @@
+#include "dem/crs.h"
+
+#include "dem/geographiclib.h"
+#include "lib/base/error.h"
+#include "lib/base/size.h"
+
+#include <math.h>
+#include <proj.h>
+#include <proj_experimental.h>
+
+struct dem_projection {
+    PJ_CONTEXT *context;
+    PJ *to_lonlat; /* NULL: coordinates are longitude and latitude already */
+};
+
+struct dem_local_frame {
+    void *tangent;
+};
+
+/* ---- Projections ---- */
+
+/* The operation from a projected CRS to its own geographic CRS in degrees, in the order x, y to longitude, latitude. */
+static PJ *make_operation(PJ_CONTEXT *context, const char *wkt)
+{
+    PJ *crs = proj_create(context, wkt);
+    PJ *base = crs ? proj_crs_get_geodetic_crs(context, crs) : NULL;
+    PJ *degrees =
+        base ? proj_crs_alter_cs_angular_unit(context, base, "degree", 0.017453292519943295, NULL, NULL) : NULL;
+    PJ *any_order = degrees ? proj_create_crs_to_crs_from_pj(context, crs, degrees, NULL, NULL) : NULL;
+    PJ *operation = any_order ? proj_normalize_for_visualization(context, any_order) : NULL;
+    proj_destroy(any_order);
+    proj_destroy(degrees);
+    proj_destroy(base);
+    proj_destroy(crs);
+    return operation;
+}
+
+static tl_status prepare(dem_projection *projection, const tl_crs *crs, tl_error *error)
+{
+    if (crs->geographic)
+        return TL_OK;
+    projection->context = proj_context_create();
+    if (!projection->context)
+        return tl_fail_memory(error, crs->name);
+    proj_log_level(projection->context, PJ_LOG_NONE);
+    proj_context_set_enable_network(projection->context, 0);
+    projection->to_lonlat = make_operation(projection->context, crs->wkt);
+    if (!projection->to_lonlat)
+        return tl_fail(error, TL_ERROR_DATA, "PROJ cannot convert coordinates of %s to longitude and latitude",
+                       crs->name);
+    return TL_OK;
+}
+
+dem_projection *dem_projection_create(const tl_crs *crs, tl_error *error)
+{
+    dem_projection *projection = calloc(1, sizeof *projection);
+    if (!projection) {
+        tl_fail_memory(error, crs->name);
+        return NULL;
+    }
+    if (prepare(projection, crs, error) == TL_OK)
+        return projection;
+    dem_projection_destroy(projection);
+    return NULL;
+}
+
+void dem_projection_destroy(dem_projection *projection)
+{
+    if (!projection)
+        return;
+    proj_destroy(projection->to_lonlat);
+    if (projection->context) /* NULL would be PROJ's default context */
+        proj_context_destroy(projection->context);
+    free(projection);
+}
+
+void dem_projection_to_lonlat(dem_projection *projection, size_t n, double *x, double *y)
+{
+    if (!projection->to_lonlat)
+        return;
+    proj_trans_generic(projection->to_lonlat, PJ_FWD, x, sizeof *x, n, y, sizeof *y, n, NULL, 0, 0, NULL, 0, 0);
+    for (size_t k = 0; k < n; k++)
+        if (!isfinite(x[k]) || !isfinite(y[k]))
+            x[k] = y[k] = NAN;
+}
+
+/* ---- Local frames ---- */
+
+dem_local_frame *dem_local_frame_create(const tl_crs *crs, double longitude, double latitude, double height,
+                                        tl_error *error)
+{
+    dem_local_frame *frame = calloc(1, sizeof *frame);
+    if (!frame) {
+        tl_fail_memory(error, crs->name);
+        return NULL;
+    }
+    frame->tangent = dem_tangent_create(crs->semi_major, crs->flattening, longitude, latitude, height);
+    if (frame->tangent)
+        return frame;
+    free(frame);
+    tl_fail(error, TL_ERROR_ARGUMENT, "no local frame can be laid at longitude %.9g, latitude %.9g, height %.9g",
+            longitude, latitude, height);
+    return NULL;
+}
+
+void dem_local_frame_destroy(dem_local_frame *frame)
+{
+    if (!frame)
+        return;
+    dem_tangent_destroy(frame->tangent);
+    free(frame);
+}
+
+void dem_local_frame_forward(const dem_local_frame *frame, double longitude, double latitude, double height,
+                             double xyz[3])
+{
+    dem_tangent_forward(frame->tangent, longitude, latitude, height, xyz);
+}
+
+/* ---- Cells ---- */
+
+/* Metres of one step (dx, dy) in degrees about the middle (x, y). A step of more than 10 degrees is measured on a part
+ * of it, for the geodesic of a long one leaves the parallel far behind. */
+static double geodesic_step(const tl_crs *crs, double x, double y, double dx, double dy)
+{
+    double largest = fmax(fabs(dx), fabs(dy)), part = largest > 10 ? 10 / largest : 1;
+    double south = fmax(y - dy * part / 2, -90), north = fmin(y + dy * part / 2, 90);
+    if (dy < 0) {
+        south = fmin(y - dy * part / 2, 90);
+        north = fmax(y + dy * part / 2, -90);
+    }
+    return dem_geodesic_length(crs->semi_major, crs->flattening, x - dx * part / 2, south, x + dx * part / 2, north) /
+           part;
+}
+
+tl_status dem_georef_measure(tl_georef *georef, int64_t width, int64_t height, tl_error *error)
+{
+    (void)error;
+    const double *t = georef->transform;
+    const tl_crs *crs = georef->crs;
+    double unit = georef->located && crs ? crs->unit : 1;
+    georef->cell_x = hypot(t[1], t[4]) * unit;
+    georef->cell_y = hypot(t[2], t[5]) * unit;
+    if (!georef->located || !crs || !crs->geographic)
+        return TL_OK;
+    double i = 0.5 * (double)(width - 1), j = 0.5 * (double)(height - 1);
+    double x = t[0] + t[1] * i + t[2] * j, y = t[3] + t[4] * i + t[5] * j;
+    double along_row = geodesic_step(crs, x, y, t[1], t[4]), along_column = geodesic_step(crs, x, y, t[2], t[5]);
+    if (along_row > 0 && along_column > 0 && isfinite(along_row) && isfinite(along_column)) {
+        georef->cell_x = along_row;
+        georef->cell_y = along_column;
+    }
+    return TL_OK;
+}

@@ -1,0 +1,33 @@
+/* The GeoTIFF keys of a file, checked, and where its samples lie. */
+#ifndef DEM_GEOKEYS_H
+#define DEM_GEOKEYS_H
+
+#include "dem/tiff_file.h"
+
+/* Every entry of the directory is sound: what it points to is there. */
+typedef struct dem_geokeys {
+    uint16_t *directory; /* header and entries, 4 numbers each; NULL: the file has no keys */
+    double *doubles;
+    char *ascii; /* ended by a zero */
+    size_t directory_count, double_count, ascii_count;
+} dem_geokeys;
+
+tl_status dem_geokeys_read(TIFF *tiff, const char *path, dem_geokeys *out, tl_error *error);
+void dem_geokeys_finish(dem_geokeys *keys);
+
+/* Values of single keys; false, or NULL, where a key is not there as that type. */
+bool dem_geokeys_short(const dem_geokeys *keys, uint16_t key, uint16_t *value);
+bool dem_geokeys_double(const dem_geokeys *keys, uint16_t key, double *value);
+/* A copy, without the bar that ends it; the caller frees it. */
+char *dem_geokeys_text(const dem_geokeys *keys, uint16_t key);
+
+/* AREA where the keys do not say POINT. */
+tl_raster_type dem_geokeys_raster_type(const dem_geokeys *keys);
+/* Metres in one unit of height. */
+double dem_geokeys_height_unit(const dem_geokeys *keys);
+
+/* The transform of sample positions from the pixel scale and tie point, the transformation matrix, or tie points that
+ * fit an affine map; false, `transform` untouched, where there is none of them. */
+bool dem_tiff_transform(TIFF *tiff, tl_raster_type type, double transform[6]);
+
+#endif

@@ -1,0 +1,308 @@
+/* The unit of decoding and caching is the chunk: a tile, a strip, or some rows of a strip that is too large to be kept
+ * whole. Chunks are numbered row by row of the raster: (block row * chunks a block + part) * blocks across + column. */
+#include "dem/tiff_blocks.h"
+
+#include "dem/block_cache.h"
+#include "dem/tiff_samples.h"
+#include "lib/base/error.h"
+#include "lib/base/size.h"
+
+#include <pthread.h>
+#include <string.h>
+
+/* Threads that want the same chunk wait for each other instead of decoding it twice; chunks whose numbers differ by a
+ * multiple of this wait needlessly. */
+enum { DECODE_LOCKS = 64 };
+
+/* A large strip is decoded from its top, by one handle that remembers how far it is. */
+typedef struct strip_stream {
+    dem_tiff_handle *handle; /* NULL: not begun */
+    int64_t next_row;        /* of the raster */
+} strip_stream;
+
+struct dem_blocks {
+    dem_tiff_file *file;
+    dem_layout layout;
+    dem_block_cache *cache;
+    int64_t parts; /* chunks a block */
+    strip_stream stream;
+    pthread_mutex_t locks[DECODE_LOCKS];
+};
+
+typedef struct chunk {
+    int64_t index;
+    int64_t column, row; /* of the block, in blocks */
+    int64_t first, rows; /* rows of the raster, within the block; rows beyond the raster's last are not among them */
+} chunk;
+
+dem_blocks *dem_blocks_create(dem_tiff_file *file, const dem_layout *layout, size_t cache_bytes, tl_error *error)
+{
+    dem_blocks *blocks = calloc(1, sizeof *blocks);
+    int64_t parts = tl_div_up(layout->block_height, layout->chunk_rows);
+    if (blocks)
+        blocks->cache = dem_block_cache_create(cache_bytes, (uint64_t)(layout->across * layout->down * parts));
+    if (!blocks || !blocks->cache) {
+        free(blocks);
+        tl_fail_memory(error, dem_tiff_file_path(file));
+        return NULL;
+    }
+    blocks->file = file;
+    blocks->layout = *layout;
+    blocks->parts = parts;
+    for (size_t i = 0; i < DECODE_LOCKS; i++)
+        pthread_mutex_init(&blocks->locks[i], NULL);
+    return blocks;
+}
+
+void dem_blocks_destroy(dem_blocks *blocks)
+{
+    if (!blocks)
+        return;
+    if (blocks->stream.handle)
+        dem_tiff_give_back(blocks->file, blocks->stream.handle);
+    dem_block_cache_destroy(blocks->cache);
+    for (size_t i = 0; i < DECODE_LOCKS; i++)
+        pthread_mutex_destroy(&blocks->locks[i]);
+    free(blocks);
+}
+
+static chunk chunk_at(const dem_blocks *blocks, int64_t column, int64_t y)
+{
+    const dem_layout *layout = &blocks->layout;
+    chunk self = {.column = column, .row = y / layout->block_height};
+    int64_t top = self.row * layout->block_height, part = (y - top) / layout->chunk_rows;
+    self.index = (self.row * blocks->parts + part) * layout->across + column;
+    self.first = top + part * layout->chunk_rows;
+    int64_t end = tl_int64_min(self.first + layout->chunk_rows, top + layout->block_height);
+    self.rows = tl_int64_min(end, layout->height) - self.first;
+    return self;
+}
+
+/* ---- Decoding ---- */
+
+static uint32_t block_number(const dem_layout *layout, const chunk *self)
+{
+    int64_t plane = layout->separate ? (int64_t)layout->band * layout->across * layout->down : 0;
+    return (uint32_t)(plane + self->row * layout->across + self->column);
+}
+
+static tl_status fail_block(const dem_blocks *blocks, const chunk *self, const dem_tiff_handle *handle, tl_error *error)
+{
+    const dem_layout *layout = &blocks->layout;
+    int64_t x = self->column * layout->block_width;
+    return tl_fail(error, TL_ERROR_DATA,
+                   "%s: the %s at column %lld, row %lld cannot be decoded (is the file complete?): %s",
+                   dem_tiff_file_path(blocks->file), layout->tiled ? "tile" : "strip", (long long)x,
+                   (long long)self->first, dem_tiff_message(handle, "it holds too few bytes"));
+}
+
+/* Whether a block of `bytes` compressed bytes can hold what it should: a check against files of a few bytes that would
+ * have gigabytes allocated. */
+static bool is_plausible(const dem_layout *layout, uint64_t bytes)
+{
+    int64_t expansion = dem_codec_expansion(layout->codec);
+    int64_t decoded = layout->row_bytes * layout->block_height;
+    /* the last strip of a file may hold fewer rows */
+    if (!layout->tiled)
+        decoded = layout->row_bytes * tl_int64_min(layout->block_height, layout->height);
+    return !expansion || decoded < (16 << 20) || (double)bytes * (double)expansion >= (double)decoded;
+}
+
+/* Rows of a block, each `row_bytes` long, to heights. */
+static void convert_rows(const dem_layout *layout, const chunk *self, const char *rows, float *heights)
+{
+    for (int64_t row = 0; row < self->rows; row++)
+        dem_samples_to_heights(layout, rows + row * layout->row_bytes, (size_t)layout->block_width,
+                               heights + row * layout->block_width);
+}
+
+static tl_status decode_block(dem_blocks *blocks, const chunk *self, dem_tiff_handle *handle, float *heights,
+                              tl_error *error)
+{
+    const dem_layout *layout = &blocks->layout;
+    int64_t rows = layout->tiled ? layout->block_height : self->rows;
+    tmsize_t bytes = (tmsize_t)(rows * layout->row_bytes);
+    char *raw = malloc((size_t)bytes);
+    if (!raw)
+        return tl_fail_memory(error, dem_tiff_file_path(blocks->file));
+    uint32_t number = block_number(layout, self);
+    tmsize_t got = layout->tiled ? TIFFReadEncodedTile(handle->tiff, number, raw, bytes)
+                                 : TIFFReadEncodedStrip(handle->tiff, number, raw, bytes);
+    tl_status status = got == bytes ? TL_OK : fail_block(blocks, self, handle, error);
+    if (status == TL_OK)
+        convert_rows(layout, self, raw, heights);
+    free(raw);
+    return status;
+}
+
+static void fill_sparse(const dem_layout *layout, size_t count, float *heights)
+{
+    float height = dem_height_of(&layout->rule, layout->has_nodata ? layout->nodata : 0);
+    for (size_t k = 0; k < count; k++)
+        heights[k] = height;
+}
+
+/* Decides what a block's table entry says before anything is allocated for it. */
+static tl_status look_up_block(const dem_blocks *blocks, const chunk *self, dem_tiff_handle *handle, bool *sparse,
+                               tl_error *error)
+{
+    int failed = 0;
+    uint64_t bytes = TIFFGetStrileByteCountWithErr(handle->tiff, block_number(&blocks->layout, self), &failed);
+    if (failed)
+        return fail_block(blocks, self, handle, error);
+    *sparse = bytes == 0;
+    if (*sparse || is_plausible(&blocks->layout, bytes))
+        return TL_OK;
+    return fail_block(blocks, self, handle, error);
+}
+
+static tl_status decode_whole(dem_blocks *blocks, const chunk *self, dem_tiff_handle *handle, float **heights,
+                              tl_error *error)
+{
+    const dem_layout *layout = &blocks->layout;
+    bool sparse;
+    tl_status status = look_up_block(blocks, self, handle, &sparse, error);
+    if (status != TL_OK)
+        return status;
+    *heights = tl_alloc_grid(layout->block_width, self->rows, sizeof **heights);
+    if (!*heights)
+        return tl_fail_memory(error, dem_tiff_file_path(blocks->file));
+    if (sparse)
+        fill_sparse(layout, (size_t)(layout->block_width * self->rows), *heights);
+    else
+        status = decode_block(blocks, self, handle, *heights, error);
+    if (status != TL_OK)
+        free(*heights);
+    return status;
+}
+
+static tl_status load_whole(dem_blocks *blocks, const chunk *self, dem_cached_block **out, tl_error *error)
+{
+    float *heights;
+    dem_tiff_handle *handle;
+    tl_status status = dem_tiff_take(blocks->file, &handle, error);
+    if (status != TL_OK)
+        return status;
+    status = decode_whole(blocks, self, handle, &heights, error);
+    dem_tiff_give_back(blocks->file, handle);
+    if (status != TL_OK)
+        return status;
+    *out = dem_block_cache_add(blocks->cache, (uint64_t)self->index, heights,
+                               (size_t)(blocks->layout.block_width * self->rows));
+    return *out ? TL_OK : tl_fail_memory(error, dem_tiff_file_path(blocks->file));
+}
+
+/* ---- Large strips ---- */
+
+/* Decodes the rows of one chunk at the stream's place. */
+static tl_status decode_rows(dem_blocks *blocks, const chunk *self, char *row, float *heights, tl_error *error)
+{
+    const dem_layout *layout = &blocks->layout;
+    dem_tiff_handle *handle = blocks->stream.handle;
+    for (int64_t k = 0; k < self->rows; k++) {
+        uint16_t plane = layout->separate ? (uint16_t)layout->band : 0;
+        if (TIFFReadScanline(handle->tiff, row, (uint32_t)(self->first + k), plane) != 1)
+            return fail_block(blocks, self, handle, error);
+        dem_samples_to_heights(layout, row, (size_t)layout->width, heights + k * layout->width);
+    }
+    return TL_OK;
+}
+
+static tl_status stream_chunk(dem_blocks *blocks, const chunk *self, dem_cached_block **out, tl_error *error)
+{
+    const dem_layout *layout = &blocks->layout;
+    bool sparse;
+    tl_status status = look_up_block(blocks, self, blocks->stream.handle, &sparse, error);
+    if (status != TL_OK)
+        return status;
+    float *heights = tl_alloc_grid(layout->width, self->rows, sizeof *heights);
+    char *row = malloc((size_t)layout->row_bytes);
+    if (!heights || !row)
+        status = tl_fail_memory(error, dem_tiff_file_path(blocks->file));
+    else if (sparse)
+        fill_sparse(layout, (size_t)(layout->width * self->rows), heights);
+    else
+        status = decode_rows(blocks, self, row, heights, error);
+    free(row);
+    if (status != TL_OK) {
+        free(heights);
+        blocks->stream.next_row = INT64_MAX; /* wherever it stands: start again */
+        return status;
+    }
+    blocks->stream.next_row = self->first + self->rows;
+    *out = dem_block_cache_add(blocks->cache, (uint64_t)self->index, heights, (size_t)(layout->width * self->rows));
+    return *out ? TL_OK : tl_fail_memory(error, dem_tiff_file_path(blocks->file));
+}
+
+/* Every row above must be decoded first; what passes by goes into the cache, for it is likely to be wanted too. */
+static tl_status load_streamed(dem_blocks *blocks, const chunk *self, dem_cached_block **out, tl_error *error)
+{
+    strip_stream *stream = &blocks->stream;
+    int64_t top = self->row * blocks->layout.block_height;
+    tl_status status = stream->handle ? TL_OK : dem_tiff_take(blocks->file, &stream->handle, error);
+    if (status != TL_OK)
+        return status;
+    dem_tiff_forget(stream->handle);
+    int64_t from = stream->next_row > top && stream->next_row <= self->first ? stream->next_row : top;
+    for (int64_t y = from;;) {
+        chunk at = chunk_at(blocks, 0, y);
+        status = stream_chunk(blocks, &at, out, error);
+        if (status != TL_OK || at.index == self->index)
+            return status;
+        dem_block_cache_unpin(blocks->cache, *out);
+        y = at.first + at.rows;
+    }
+}
+
+/* ---- Reading ---- */
+
+static tl_status get_chunk(dem_blocks *blocks, const chunk *self, dem_cached_block **out, tl_error *error)
+{
+    uint64_t key = (uint64_t)self->index;
+    *out = dem_block_cache_find(blocks->cache, key);
+    if (*out)
+        return TL_OK;
+    bool streamed = blocks->parts > 1;
+    pthread_mutex_t *lock = &blocks->locks[streamed ? 0 : key % DECODE_LOCKS];
+    pthread_mutex_lock(lock);
+    tl_status status = TL_OK;
+    *out = dem_block_cache_find(blocks->cache, key);
+    if (!*out)
+        status = (streamed ? load_streamed : load_whole)(blocks, self, out, error);
+    pthread_mutex_unlock(lock);
+    return status;
+}
+
+/* Copies what a chunk and the window share. */
+static void copy_chunk(const dem_layout *layout, const chunk *self, const float *heights, tl_window window, float *out)
+{
+    int64_t left = self->column * layout->block_width;
+    int64_t x0 = tl_int64_max(window.x, left), x1 = tl_int64_min(window.x + window.width, left + layout->block_width);
+    int64_t y0 = tl_int64_max(window.y, self->first);
+    int64_t y1 = tl_int64_min(window.y + window.height, self->first + self->rows);
+    for (int64_t y = y0; y < y1; y++)
+        memcpy(out + (y - window.y) * window.width + (x0 - window.x),
+               heights + (y - self->first) * layout->block_width + (x0 - left), (size_t)(x1 - x0) * sizeof *out);
+}
+
+tl_status dem_blocks_read(dem_blocks *blocks, tl_window window, float *out, tl_error *error)
+{
+    const dem_layout *layout = &blocks->layout;
+    if (window.width == 0 || window.height == 0)
+        return TL_OK;
+    int64_t last_column = (window.x + window.width - 1) / layout->block_width;
+    for (int64_t y = window.y; y < window.y + window.height;) {
+        chunk at = {0};
+        for (int64_t column = window.x / layout->block_width; column <= last_column; column++) {
+            dem_cached_block *block;
+            at = chunk_at(blocks, column, y);
+            tl_status status = get_chunk(blocks, &at, &block, error);
+            if (status != TL_OK)
+                return status;
+            copy_chunk(layout, &at, dem_cached_block_heights(block), window, out);
+            dem_block_cache_unpin(blocks->cache, block);
+        }
+        y = at.first + at.rows;
+    }
+    return TL_OK;
+}

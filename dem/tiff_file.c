@@ -1,0 +1,305 @@
+#include "dem/tiff_file.h"
+
+#include "lib/base/error.h"
+#include "lib/base/size.h"
+
+#include <errno.h>
+#include <fcntl.h>
+#include <pthread.h>
+#include <stdio.h>
+#include <string.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+enum {
+    MAX_IDLE = 16,                   /* handles kept for the next reader */
+    MIN_ALLOCATION_LIMIT = 64 << 20, /* bytes that libtiff may ask for at once, whatever the file's size */
+    MAX_ALLOCATION_LIMIT = 1 << 30,
+};
+
+struct dem_tiff_file {
+    char *path;
+    int descriptor;
+    int64_t size;
+    pthread_mutex_t lock; /* guards the list of idle handles */
+    dem_tiff_handle *idle;
+    unsigned idle_count;
+};
+
+/* ---- libtiff's I/O and messages ---- */
+
+static tmsize_t read_bytes(thandle_t user, void *out, tmsize_t count)
+{
+    dem_tiff_handle *handle = user;
+    tmsize_t done = 0;
+    while (done < count) {
+        ssize_t got =
+            pread(handle->file->descriptor, (char *)out + done, (size_t)(count - done), (off_t)handle->position);
+        if (got < 0 && errno == EINTR)
+            continue;
+        if (got <= 0)
+            break;
+        done += got;
+        handle->position += (uint64_t)got;
+    }
+    return done;
+}
+
+static tmsize_t write_bytes(thandle_t user, void *bytes, tmsize_t count)
+{
+    (void)user;
+    (void)bytes;
+    (void)count;
+    return 0;
+}
+
+static toff_t seek(thandle_t user, toff_t offset, int whence)
+{
+    dem_tiff_handle *handle = user;
+    uint64_t base = whence == SEEK_CUR ? handle->position : whence == SEEK_END ? (uint64_t)handle->file->size : 0;
+    /* off_t is signed: a position beyond it can hold nothing */
+    if (base + offset > (uint64_t)INT64_MAX)
+        return (toff_t)-1;
+    return handle->position = base + offset;
+}
+
+static int close_nothing(thandle_t user)
+{
+    (void)user;
+    return 0;
+}
+
+static toff_t size_of(thandle_t user)
+{
+    return (toff_t)((dem_tiff_handle *)user)->file->size;
+}
+
+static int catch_error(TIFF *tiff, void *user, const char *module, const char *format, va_list arguments)
+{
+    (void)tiff;
+    (void)module;
+    dem_tiff_handle *handle = user;
+    if (!handle->message[0])
+        vsnprintf(handle->message, sizeof handle->message, format, arguments);
+    return 1; /* handled: the process's own handlers, which print, are not called */
+}
+
+static int ignore_warning(TIFF *tiff, void *user, const char *module, const char *format, va_list arguments)
+{
+    (void)tiff;
+    (void)user;
+    (void)module;
+    (void)format;
+    (void)arguments;
+    return 1;
+}
+
+void dem_tiff_forget(dem_tiff_handle *handle)
+{
+    handle->message[0] = 0;
+}
+
+const char *dem_tiff_message(const dem_tiff_handle *handle, const char *otherwise)
+{
+    return handle->message[0] ? handle->message : otherwise;
+}
+
+/* ---- Handles ---- */
+
+/* Tables and compressed blocks come from the file, so what libtiff may allocate is bounded by the file's size; 8 covers
+ * tables of 16-bit entries, which are widened to 64 bits, with room to grow. */
+static tmsize_t allocation_limit(const dem_tiff_file *file)
+{
+    if (file->size > MAX_ALLOCATION_LIMIT / 8)
+        return (tmsize_t)tl_int64_max(MAX_ALLOCATION_LIMIT, file->size);
+    return (tmsize_t)tl_int64_max(MIN_ALLOCATION_LIMIT, 8 * file->size);
+}
+
+/* r: read; O, D: load the tables of block offsets in pieces and when needed, for they may be larger than the rest;
+ * m: no memory mapping, so that a file cut short by someone else is an error and no signal. */
+static TIFF *open_tiff(dem_tiff_handle *handle)
+{
+    TIFFOpenOptions *options = TIFFOpenOptionsAlloc();
+    if (!options)
+        return NULL;
+    TIFFOpenOptionsSetMaxSingleMemAlloc(options, allocation_limit(handle->file));
+    TIFFOpenOptionsSetErrorHandlerExtR(options, catch_error, handle);
+    TIFFOpenOptionsSetWarningHandlerExtR(options, ignore_warning, handle);
+    TIFF *tiff = TIFFClientOpenExt(handle->file->path, "rDOm", handle, read_bytes, write_bytes, seek, close_nothing,
+                                   size_of, NULL, NULL, options);
+    TIFFOpenOptionsFree(options);
+    return tiff;
+}
+
+static tl_status open_handle(const dem_tiff_file *file, dem_tiff_handle **out, tl_error *error)
+{
+    dem_tiff_handle *handle = calloc(1, sizeof *handle);
+    if (!handle)
+        return tl_fail_memory(error, file->path);
+    handle->file = file;
+    handle->tiff = open_tiff(handle);
+    if (!handle->tiff) {
+        tl_fail(error, TL_ERROR_DATA, "%s: cannot read the TIFF directory (is the file complete?): %s", file->path,
+                dem_tiff_message(handle, "no reason given"));
+        free(handle);
+        return TL_ERROR_DATA;
+    }
+    *out = handle;
+    return TL_OK;
+}
+
+void dem_tiff_drop(dem_tiff_handle *handle)
+{
+    TIFFClose(handle->tiff);
+    free(handle);
+}
+
+tl_status dem_tiff_take(dem_tiff_file *file, dem_tiff_handle **out, tl_error *error)
+{
+    pthread_mutex_lock(&file->lock);
+    dem_tiff_handle *handle = file->idle;
+    if (handle) {
+        file->idle = handle->next;
+        file->idle_count--;
+    }
+    pthread_mutex_unlock(&file->lock);
+    if (!handle)
+        return open_handle(file, out, error);
+    dem_tiff_forget(handle);
+    *out = handle;
+    return TL_OK;
+}
+
+void dem_tiff_give_back(dem_tiff_file *file, dem_tiff_handle *handle)
+{
+    pthread_mutex_lock(&file->lock);
+    bool keep = file->idle_count < MAX_IDLE;
+    if (keep) {
+        handle->next = file->idle;
+        file->idle = handle;
+        file->idle_count++;
+    }
+    pthread_mutex_unlock(&file->lock);
+    if (!keep)
+        dem_tiff_drop(handle);
+}
+
+/* ---- The file ---- */
+
+static tl_status check_signature(const dem_tiff_file *file, tl_error *error)
+{
+    static const unsigned char signatures[4][4] = {
+        {'I', 'I', 42, 0}, {'M', 'M', 0, 42}, {'I', 'I', 43, 0}, {'M', 'M', 0, 43}};
+    unsigned char head[4];
+    if (file->size == 0)
+        return tl_fail(error, TL_ERROR_DATA, "%s: the file is empty", file->path);
+    ssize_t got;
+    do
+        got = pread(file->descriptor, head, sizeof head, 0);
+    while (got < 0 && errno == EINTR);
+    if (got < 0)
+        return tl_fail_system(error, file->path, "read", errno);
+    for (size_t i = 0; got == sizeof head && i < sizeof signatures / sizeof *signatures; i++)
+        if (memcmp(head, signatures[i], sizeof head) == 0)
+            return TL_OK;
+    return tl_fail(error, TL_ERROR_DATA, "%s: not a TIFF file", file->path);
+}
+
+static tl_status open_descriptor(dem_tiff_file *file, tl_error *error)
+{
+    struct stat status;
+    /* O_NONBLOCK: opening a named pipe without it waits for a writer */
+    file->descriptor = open(file->path, O_RDONLY | O_CLOEXEC | O_NONBLOCK);
+    if (file->descriptor < 0)
+        return tl_fail_system(error, file->path, "open", errno);
+    if (fstat(file->descriptor, &status) != 0)
+        return tl_fail_system(error, file->path, "examine", errno);
+    if (S_ISDIR(status.st_mode))
+        return tl_fail(error, TL_ERROR_DATA, "%s: is a directory; name a GeoTIFF file in it", file->path);
+    if (!S_ISREG(status.st_mode))
+        return tl_fail(error, TL_ERROR_DATA, "%s: not a regular file; copy its content to one", file->path);
+    file->size = status.st_size;
+    return check_signature(file, error);
+}
+
+dem_tiff_file *dem_tiff_file_open(const char *path, tl_error *error)
+{
+    dem_tiff_file *file = calloc(1, sizeof *file);
+    char *copy = file ? strdup(path) : NULL;
+    if (!copy) {
+        free(file);
+        tl_fail_memory(error, path);
+        return NULL;
+    }
+    file->path = copy;
+    file->descriptor = -1;
+    pthread_mutex_init(&file->lock, NULL);
+    if (open_descriptor(file, error) != TL_OK) {
+        dem_tiff_file_close(file);
+        return NULL;
+    }
+    return file;
+}
+
+void dem_tiff_file_close(dem_tiff_file *file)
+{
+    if (!file)
+        return;
+    for (dem_tiff_handle *handle = file->idle, *next; handle; handle = next) {
+        next = handle->next;
+        dem_tiff_drop(handle);
+    }
+    if (file->descriptor >= 0)
+        close(file->descriptor);
+    pthread_mutex_destroy(&file->lock);
+    free(file->path);
+    free(file);
+}
+
+const char *dem_tiff_file_path(const dem_tiff_file *file)
+{
+    return file->path;
+}
+
+int64_t dem_tiff_file_size(const dem_tiff_file *file)
+{
+    return file->size;
+}
+
+/* ---- Tags ---- */
+
+/* libtiff counts in 16 or 32 bits depending on who registered the tag: itself for an unknown one, or libgeotiff, where
+ * another part of the process has used it. */
+const void *dem_tiff_array(TIFF *tiff, uint32_t tag, TIFFDataType type, size_t *count)
+{
+    const TIFFField *field = TIFFFindField(tiff, tag, TIFF_ANY);
+    const void *values = NULL;
+    *count = 0;
+    if (!field || TIFFFieldDataType(field) != type)
+        return NULL;
+    if (!TIFFFieldPassCount(field)) {
+        if (type != TIFF_ASCII || !TIFFGetField(tiff, tag, &values) || !values)
+            return NULL;
+        *count = strlen(values);
+        return values;
+    }
+    if (TIFFFieldReadCount(field) == TIFF_VARIABLE2) {
+        uint32_t items = 0;
+        if (!TIFFGetField(tiff, tag, &items, &values))
+            return NULL;
+        *count = items;
+    } else {
+        uint16_t items = 0;
+        if (!TIFFGetField(tiff, tag, &items, &values))
+            return NULL;
+        *count = items;
+    }
+    return *count ? values : NULL;
+}
+
+char *dem_tiff_text(TIFF *tiff, uint32_t tag)
+{
+    size_t count;
+    const char *text = dem_tiff_array(tiff, tag, TIFF_ASCII, &count);
+    return text ? strndup(text, count) : NULL;
+}
