@@ -1,0 +1,97 @@
+/* The inside of the strict framework: its data, and the decision over one patch of the lattice.
+ *
+ * The lattice is virtual: (2^k + 1)^2 vertices from sample (0, 0), k as small as covers the raster. At stage s (a power
+ * of two) it has two kinds of vertices that may split triangles:
+ *
+ * - centres, (odd s, odd s): the middle of a square of side 2 s, which its diagonal cuts into two triangles. The
+ *   diagonal runs through the middle of the parent's square: '\' where the square's column plus row is even, else '/'.
+ * - edge points, (odd s, even s) and (even s, odd s): the middle of a side of such a square, the hypotenuse of a
+ *   triangle on either side whose right angle is at the centre of the square there.
+ *
+ * A triangle is made by splitting a larger one at the vertex of its right angle, so that vertex is its "parent".
+ * Triangles outside of the raster do not exist; those that reach over its right or bottom rim are always split. */
+#ifndef TL_DEM_FRAMEWORK_H
+#define TL_DEM_FRAMEWORK_H
+
+#include "lib/talus.h"
+
+enum { TL_BLOCK_LOG = 8, TL_BLOCK = 1 << TL_BLOCK_LOG };
+
+struct tl_framework {
+    tl_source_info info; /* of the DEM; what it points to is the framework's own */
+    double max_error;
+    unsigned threads;
+    int lattice_log; /* k */
+    int64_t block; /* side of the squares that are decided alone: TL_BLOCK, or the whole lattice where it is smaller */
+    int64_t columns, rows;    /* of blocks */
+    size_t words;             /* of 64 samples in a row of the two bitmaps */
+    uint64_t *split, *points; /* vertices that split triangles; corners of triangles that are drawn */
+    uint32_t *rank;           /* [row][block column]: number of points before */
+    float *heights;           /* of the points, row by row */
+    size_t point_count, isolated_count;
+};
+
+static inline bool tl_bit(const uint64_t *bits, size_t words, int64_t x, int64_t y)
+{
+    return bits[(size_t)y * words + (size_t)(x >> 6)] >> (x & 63) & 1;
+}
+
+static inline void tl_bit_set(uint64_t *bits, size_t words, int64_t x, int64_t y)
+{
+    bits[(size_t)y * words + (size_t)(x >> 6)] |= UINT64_C(1) << (x & 63);
+}
+
+/* Fills in `points`, their number, rank and heights, and the number of isolated samples, from `split` and the DEM's
+ * heights (width * height, NaN for voids). */
+tl_status tl_framework_find_points(tl_framework *framework, const float *dem, bool voids, const tl_run *run,
+                                   tl_error *error);
+
+/* A rectangle of the lattice whose triangles are decided together, coarser and coarser. */
+typedef struct tl_patch {
+    const float *heights; /* of vertex (0, 0); `stride` from row to row */
+    int64_t stride;
+    int64_t width, height; /* edges to decide: vertices 0 ... width, 0 ... height */
+    int64_t rim_x, rim_y;  /* last column and row of the raster, counted from vertex (0, 0) */
+    int64_t x, y;          /* vertex (0, 0) on the lattice */
+    unsigned char *split;  /* one byte for every vertex at multiples of 2^split_log: set where needed */
+    int64_t split_stride;
+    int split_log;
+    double max_error;
+    double sum_limit; /* what the nested sum may reach: max_error less the rounding of the whole patch */
+    bool careful;     /* double arithmetic rounds on these heights: add its bound to every error */
+    /* Bounds of the error of the triangles that a vertex splits: infinite where it is needed, -infinite where all is
+     * void or outside. Of centres (with a neutral frame), of horizontal and of vertical edge points. */
+    float *centres, *across, *down;
+} tl_patch;
+
+/* Number of squares of side 2 s along `length` edges. */
+static inline int64_t tl_patch_squares(int64_t length, int64_t s)
+{
+    return (length + 2 * s - 1) / (2 * s);
+}
+
+/* Items in a row of `centres` for `squares` squares: an even number and a frame. */
+static inline int64_t tl_patch_centre_stride(int64_t squares)
+{
+    return (squares + 1) / 2 * 2 + 2;
+}
+
+/* Decides all of stage 1 of a patch of samples: its edge points, then its centres. `voids` tells whether NaN may occur;
+ * the heights need a frame of one sample then, mirrored at the patch's borders. `rows` is scratch of
+ * 3 (width / 2 + 2) floats. */
+void tl_patch_decide_samples(tl_patch *patch, bool voids, float *rows);
+/* Decides row `row` of the edge points of stage s > 1 (0 ... squares of the height), after the centres of s / 2. */
+void tl_patch_decide_edges(const tl_patch *patch, int64_t s, int64_t row);
+/* Makes the frame of `centres` for stage s, after the edge points of that stage. */
+void tl_patch_frame_centres(const tl_patch *patch, int64_t s);
+/* Decides row `row` of the centres of stage s > 1, after the frame. */
+void tl_patch_decide_centres(const tl_patch *patch, int64_t s, int64_t row);
+
+/* Bound of the rounding error of evaluating a plane through heights of magnitude m at a sample: interpolation by
+ * weights or by slopes takes at most ten roundings of terms of at most 4 m. */
+static inline double tl_plane_rounding(double magnitude)
+{
+    return magnitude * (40 * 0x1p-53);
+}
+
+#endif
