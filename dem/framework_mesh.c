@@ -16,9 +16,10 @@ static const uint32_t NO_POINT = UINT32_MAX;
 
 /* ---- Points -------------------------------------------------------------------------------------- */
 
-/* A marked sample is a corner of a triangle that is drawn just where some finest triangle at it has three valid
- * corners: the leaf that holds that triangle covers valid samples, so it is not all void, and a leaf is never mixed
- * unless it is that very triangle. So this is decided from the eight neighbours alone, 64 samples at a time. */
+/* A cell with at most one void corner is drawn at its finest, whichever way its diagonal runs. So a marked sample is a
+ * corner of a triangle that is drawn just where some cell has it and two more valid corners: either the fourth is void,
+ * so that the cell is mixed and finest; or the cell is valid, and so is the leaf that covers it, for it holds valid
+ * samples and is not mixed. This is decided from the eight neighbours alone, 64 samples at a time. */
 typedef struct finder {
     tl_framework *framework;
     const float *dem;
@@ -50,18 +51,19 @@ static inline uint64_t east(const uint64_t *row, size_t w, size_t words)
     return row[w] >> 1 | (w + 1 < words ? row[w + 1] << 63 : 0);
 }
 
-/* The valid samples of word w that are corners of a finest triangle with three valid corners. Samples with an even sum
- * of column and row lie on diagonals and have eight triangles, the others four. */
-static uint64_t spanned(const uint64_t *above, const uint64_t *here, const uint64_t *below, size_t w, size_t words,
-                        bool odd_row)
+/* Of three corners of a cell, whether two are valid. */
+static inline uint64_t two_of(uint64_t a, uint64_t b, uint64_t c)
 {
-    uint64_t n = above[w], s = below[w], we = west(here, w), ea = east(here, w, words);
-    uint64_t corners = (west(above, w) | east(above, w, words)) & n;
-    corners |= (west(below, w) | east(below, w, words)) & s;
-    corners |= (west(above, w) | west(below, w)) & we;
-    corners |= (east(above, w, words) | east(below, w, words)) & ea;
-    uint64_t even = odd_row ? UINT64_C(0xAAAAAAAAAAAAAAAA) : UINT64_C(0x5555555555555555);
-    return here[w] & ((corners & even) | ((n | s) & (we | ea) & ~even));
+    return (a & b) | (c & (a | b));
+}
+
+/* The valid samples of word w that have two more valid corners in some cell. */
+static uint64_t spanned(const uint64_t *above, const uint64_t *here, const uint64_t *below, size_t w, size_t words)
+{
+    uint64_t left = west(here, w), right = east(here, w, words);
+    uint64_t cells = two_of(left, west(above, w), above[w]) | two_of(above[w], east(above, w, words), right);
+    cells |= two_of(right, east(below, w, words), below[w]) | two_of(below[w], west(below, w), left);
+    return here[w] & cells;
 }
 
 static void mark_lattice_corners(tl_framework *framework)
@@ -85,7 +87,7 @@ static void find_row(const finder *self, const uint64_t *above, const uint64_t *
     for (size_t w = 0; w < words; w++) {
         points[w] |= split[w];
         if (here) {
-            uint64_t able = spanned(above, here, below, w, words, y & 1);
+            uint64_t able = spanned(above, here, below, w, words);
             points[w] &= able;
             *isolated += (unsigned)__builtin_popcountll(here[w] & ~able);
         }
@@ -235,6 +237,20 @@ typedef struct unpacked {
     uint32_t *index;
 } unpacked;
 
+/* A finest triangle of which not all corners are points: where that is only one end of its cell's diagonal, the cell is
+ * drawn with the other diagonal (once, by the triangle whose apex comes first). */
+static void draw_turned(const unpacked *from, sink *to, int32_t a, int32_t b, int32_t apex)
+{
+    int32_t opposite = a + b - apex;
+    uint32_t first = from->index[a], second = from->index[b], third = from->index[apex], fourth = from->index[opposite];
+    if (apex > opposite || third == NO_POINT || fourth == NO_POINT)
+        return;
+    if (first != NO_POINT && second == NO_POINT)
+        emit(to, first, fourth, third);
+    else if (first == NO_POINT && second != NO_POINT)
+        emit(to, fourth, second, third);
+}
+
 /* Descends into the triangle on the hypotenuse a-b; vertices are offsets into `from`, `depth` the splits that are left
  * down to the finest. A leaf is drawn where all its corners are points: one that lies outside, or covers voids, has a
  * corner that is none. */
@@ -246,8 +262,11 @@ static void draw_block(const unpacked *from, sink *to, int32_t a, int32_t b, int
         draw_block(from, to, b, apex, middle, depth - 1);
         return;
     }
-    if (from->index[a] != NO_POINT && from->index[b] != NO_POINT && from->index[apex] != NO_POINT)
-        emit(to, from->index[a], from->index[b], from->index[apex]);
+    uint32_t first = from->index[a], second = from->index[b], third = from->index[apex];
+    if (first != NO_POINT && second != NO_POINT && third != NO_POINT)
+        emit(to, first, second, third);
+    else if (!depth)
+        draw_turned(from, to, a, b, apex);
 }
 
 typedef struct corner {
