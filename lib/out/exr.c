@@ -1,0 +1,291 @@
+/* EXR heightfields through OpenEXRCore: one tiled part, one float channel "Y" (readers such as Blender take other names
+ * for colours of black), tiles compressed in parallel and written in order. */
+#include "lib/base/error.h"
+#include "lib/base/georef.h"
+#include "lib/base/parallel.h"
+#include "lib/base/size.h"
+#include "lib/out/out.h"
+
+#include <openexr.h>
+
+#include <math.h>
+#include <stdarg.h>
+#include <stdio.h>
+#include <string.h>
+#include <unistd.h>
+
+enum { PART = 0, NAME_LIMIT = 31 };
+
+/* Attributes whose values are known only when all is written; patched in the header then. */
+static const char low_name[] = "talus:lowest", high_name[] = "talus:highest";
+
+typedef struct stream {
+    tl_output *output;
+    tl_error *error; /* of the system, when it refused a write */
+} stream;
+
+static int64_t on_write(exr_const_context_t context, void *user, const void *bytes, uint64_t count, uint64_t offset,
+                        exr_stream_error_func_ptr_t fail)
+{
+    stream *self = user;
+    if (tl_output_write_at(self->output, bytes, (size_t)count, offset, self->error) != TL_OK)
+        return fail(context, EXR_ERR_WRITE_IO, "cannot write"), -1;
+    return (int64_t)count;
+}
+
+static void on_error(exr_const_context_t context, exr_result_t code, const char *text)
+{
+    /* the codes that calls return say enough; nothing may go to stderr */
+    (void)context;
+    (void)code;
+    (void)text;
+}
+
+static tl_status exr_failed(exr_result_t code, const stream *to, tl_error *error)
+{
+    if (to->error->status != TL_OK)
+        return to->error->status; /* described already, by the system's own words */
+    return tl_fail(error, code == EXR_ERR_OUT_OF_MEMORY ? TL_ERROR_MEMORY : TL_ERROR_IO,
+                   "%s: OpenEXR cannot write it: %s", tl_output_path(to->output), exr_get_default_error_message(code));
+}
+
+static exr_compression_t compression_of(tl_compression compression)
+{
+    switch (compression) {
+    case TL_COMPRESSION_NONE:
+        return EXR_COMPRESSION_NONE;
+    case TL_COMPRESSION_ZIPS:
+        return EXR_COMPRESSION_ZIPS;
+    case TL_COMPRESSION_PIZ:
+        return EXR_COMPRESSION_PIZ;
+    default:
+        return EXR_COMPRESSION_ZIP;
+    }
+}
+
+static exr_result_t set_georeference(exr_context_t file, const tl_source_info *info)
+{
+    double t[6];
+    out_gdal_transform(info, t);
+    exr_attr_m33d_t matrix = {.m = {t[1], t[2], t[0], t[4], t[5], t[3], 0, 0, 1}};
+    exr_result_t code = EXR_ERR_SUCCESS;
+    if (info->georef.located)
+        code = exr_attr_set_m33d(file, PART, "gdal:geoTransform", &matrix);
+    if (code == EXR_ERR_SUCCESS && info->georef.crs && *tl_crs_wkt(info->georef.crs))
+        code = exr_attr_set_string(file, PART, "gdal:crsWkt", tl_crs_wkt(info->georef.crs));
+    if (code == EXR_ERR_SUCCESS)
+        code = exr_attr_set_string(file, PART, "gdal:AREA_OR_POINT", info->type == TL_RASTER_AREA ? "Area" : "Point");
+    if (code == EXR_ERR_SUCCESS)
+        code = exr_attr_set_double(file, PART, "talus:heightUnit", info->georef.height_unit);
+    return code;
+}
+
+static exr_result_t set_parameters(exr_context_t file, const tl_source_info *info)
+{
+    exr_result_t code = exr_attr_set_string(file, PART, "talus:version", tl_version());
+    if (code == EXR_ERR_SUCCESS)
+        code = exr_attr_set_float(file, PART, low_name, NAN);
+    if (code == EXR_ERR_SUCCESS)
+        code = exr_attr_set_float(file, PART, high_name, NAN);
+    for (size_t i = 0; i < info->parameter_count && code == EXR_ERR_SUCCESS; i++) {
+        char name[NAME_LIMIT + 1]; /* longer names need a newer reader */
+        snprintf(name, sizeof name, "talus:%s", info->parameters[i].name);
+        if (strcmp(name, "talus:version") != 0)
+            code = exr_attr_set_string(file, PART, name, info->parameters[i].value);
+    }
+    return code;
+}
+
+static exr_result_t set_header(exr_context_t file, const tl_source_info *info, tl_compression compression)
+{
+    exr_attr_box2i_t window;
+    exr_attr_v2f_t centre;
+    window.min.x = window.min.y = 0;
+    window.max.x = (int32_t)info->width - 1;
+    window.max.y = (int32_t)info->height - 1;
+    centre.x = centre.y = 0;
+    int part;
+    exr_result_t code = exr_add_part(file, "heights", EXR_STORAGE_TILED, &part);
+    if (code ==
+        EXR_ERR_SUCCESS) /* random order, for the file is complete when it gets its name; ours is always the same */
+        code = exr_initialize_required_attr(file, PART, &window, &window, 1.0f, &centre, 1.0f, EXR_LINEORDER_RANDOM_Y,
+                                            compression_of(compression));
+    if (code == EXR_ERR_SUCCESS)
+        code = exr_set_tile_descriptor(file, PART, OUT_TILE, OUT_TILE, EXR_TILE_ONE_LEVEL, EXR_TILE_ROUND_DOWN);
+    if (code == EXR_ERR_SUCCESS)
+        code = exr_add_channel(file, PART, "Y", EXR_PIXEL_FLOAT, EXR_PERCEPTUALLY_LINEAR, 1, 1);
+    if (code == EXR_ERR_SUCCESS)
+        code = set_georeference(file, info);
+    if (code == EXR_ERR_SUCCESS)
+        code = set_parameters(file, info);
+    return code == EXR_ERR_SUCCESS ? exr_write_header(file) : code;
+}
+
+/* ---- tiles ---- */
+
+typedef struct worker {
+    float *heights;
+    exr_encode_pipeline_t pipeline;
+    bool begun;
+    out_extent extent;
+    tl_parallel *loop; /* of the tile in hand, for await_turn */
+    uint64_t tile;
+    bool gave_up; /* another tile has failed */
+} worker;
+
+typedef struct writing {
+    const tl_source *source;
+    exr_context_t file;
+    out_tiling tiling;
+    worker *workers;
+    stream *to;
+} writing;
+
+/* OpenEXR calls this between compressing and writing. */
+static exr_result_t await_turn(exr_encode_pipeline_t *pipeline)
+{
+    worker *self = pipeline->encoding_user_data;
+    self->gave_up = !tl_parallel_wait_turn(self->loop, self->tile);
+    return self->gave_up ? EXR_ERR_INCORRECT_CHUNK : EXR_ERR_SUCCESS;
+}
+
+static exr_result_t encode(const writing *w, worker *self, tl_window window)
+{
+    exr_chunk_info_t chunk;
+    exr_encode_pipeline_t *pipeline = &self->pipeline;
+    exr_result_t code =
+        exr_write_tile_chunk_info(w->file, PART, (int)(window.x / OUT_TILE), (int)(window.y / OUT_TILE), 0, 0, &chunk);
+    if (code == EXR_ERR_SUCCESS)
+        code = self->begun ? exr_encoding_update(w->file, PART, &chunk, pipeline)
+                           : exr_encoding_initialize(w->file, PART, &chunk, pipeline);
+    if (code != EXR_ERR_SUCCESS)
+        return code;
+    pipeline->channels[0].encode_from_ptr = (const uint8_t *)self->heights;
+    pipeline->channels[0].user_pixel_stride = sizeof(float);
+    pipeline->channels[0].user_line_stride = (int32_t)((size_t)window.width * sizeof(float));
+    pipeline->channels[0].user_bytes_per_element = sizeof(float);
+    pipeline->channels[0].user_data_type = EXR_PIXEL_FLOAT;
+    pipeline->encoding_user_data = self;
+    code = self->begun ? EXR_ERR_SUCCESS : exr_encoding_choose_default_routines(w->file, PART, pipeline);
+    self->begun = true;
+    pipeline->yield_until_ready_fn = await_turn;
+    return code == EXR_ERR_SUCCESS ? exr_encoding_run(w->file, PART, pipeline) : code;
+}
+
+static tl_status write_tile(void *context, tl_parallel *loop, uint64_t tile, unsigned index, tl_error *error)
+{
+    writing *w = context;
+    worker *self = &w->workers[index];
+    tl_window window = out_tile_window(&w->tiling, tile);
+    tl_status status = tl_source_read(w->source, w->source->info.level, window, self->heights, error);
+    if (status != TL_OK)
+        return status;
+    out_extent_add(&self->extent, self->heights, (size_t)(window.width * window.height));
+    self->loop = loop;
+    self->tile = tile;
+    exr_result_t code = encode(w, self, window);
+    if (self->gave_up)
+        return tl_fail(error, TL_ERROR_CANCELLED, "interrupted");
+    if (code != EXR_ERR_SUCCESS) /* the turn is kept, so that nobody writes behind a failure */
+        return exr_failed(code, w->to, error);
+    tl_parallel_end_turn(loop, tile);
+    return TL_OK;
+}
+
+static tl_status write_tiles(writing *w, const tl_run *run, out_extent *extent, tl_error *error)
+{
+    uint64_t tiles = (uint64_t)w->tiling.columns * (uint64_t)w->tiling.rows;
+    unsigned count = tl_parallel_workers(run, tiles);
+    tl_status status = TL_OK;
+    w->workers = calloc(count, sizeof *w->workers);
+    if (!w->workers)
+        return tl_fail_memory(error, tl_output_path(w->to->output));
+    for (unsigned i = 0; i < count; i++) {
+        w->workers[i].extent = out_extent_empty();
+        w->workers[i].heights = tl_alloc_grid(OUT_TILE, OUT_TILE, sizeof(float));
+        if (!w->workers[i].heights)
+            status = tl_fail_memory(error, tl_output_path(w->to->output));
+    }
+    if (status == TL_OK)
+        status = tl_parallel_for(run, tiles, (uint64_t)(w->tiling.width * w->tiling.height), write_tile, w, error);
+    for (unsigned i = 0; i < count; i++) {
+        out_extent_merge(extent, &w->workers[i].extent);
+        if (w->workers[i].begun)
+            exr_encoding_destroy(w->file, &w->workers[i].pipeline);
+        free(w->workers[i].heights);
+    }
+    free(w->workers);
+    return status;
+}
+
+/* ---- the header's late values ---- */
+
+/* In the file an attribute is its name, its type (both ended by 0), a 32-bit size and the value. */
+static tl_status patch_float(tl_output *output, char *header, size_t bytes, const char *name, float value,
+                             tl_error *error)
+{
+    char pattern[64] = {0};
+    size_t length = strlen(name) + 1;
+    memcpy(pattern, name, length);
+    memcpy(pattern + length, "float\0\4\0\0\0", 10);
+    length += 10;
+    for (size_t at = 0; at + length + sizeof value <= bytes; at++)
+        if (memcmp(header + at, pattern, length) == 0)
+            return tl_output_write_at(output, &value, sizeof value, at + length, error);
+    return tl_fail(error, TL_ERROR_IO, "%s: the header that OpenEXR wrote lacks %s", tl_output_path(output), name);
+}
+
+static tl_status patch_extent(tl_output *output, const out_extent *extent, tl_error *error)
+{
+    enum { HEADER_LIMIT = 1 << 20 };
+    if (extent->low > extent->high)
+        return TL_OK; /* all void: the range stays NaN */
+    char *header = malloc(HEADER_LIMIT);
+    if (!header)
+        return tl_fail_memory(error, tl_output_path(output));
+    ssize_t bytes = pread(tl_output_descriptor(output), header, HEADER_LIMIT, 0);
+    tl_status status = patch_float(output, header, bytes > 0 ? (size_t)bytes : 0, low_name, extent->low, error);
+    if (status == TL_OK)
+        status = patch_float(output, header, (size_t)bytes, high_name, extent->high, error);
+    free(header);
+    return status;
+}
+
+static tl_status check_size(const tl_source_info *info, const char *path, tl_error *error)
+{
+    /* the chunk table and the box of an EXR count in 32 bits */
+    int64_t samples;
+    if (info->width < INT32_MAX / 2 && info->height < INT32_MAX / 2 &&
+        tl_int64_mul(info->width, info->height, &samples) && samples / OUT_TILE / OUT_TILE < INT32_MAX / 2)
+        return TL_OK;
+    return tl_fail(error, TL_ERROR_ARGUMENT, "%s: %lld x %lld samples are too many for an EXR; refine by fewer levels",
+                   path, (long long)info->width, (long long)info->height);
+}
+
+tl_status out_exr_write(const tl_source *source, tl_output *output, const tl_write_options *options, tl_error *error)
+{
+    const char *path = tl_output_path(output);
+    tl_status status = check_size(&source->info, path, error);
+    if (status != TL_OK)
+        return status;
+    tl_error own = {0};
+    stream to = {.output = output, .error = &own};
+    exr_context_initializer_t start = EXR_DEFAULT_CONTEXT_INITIALIZER;
+    start.error_handler_fn = on_error;
+    start.user_data = &to;
+    start.write_fn = on_write;
+    writing w = {.source = source, .tiling = out_tiling_of(source), .to = &to};
+    exr_result_t code = exr_start_write(&w.file, path, EXR_WRITE_FILE_DIRECTLY, &start);
+    if (code != EXR_ERR_SUCCESS)
+        return tl_fail(error, TL_ERROR_IO, "%s: OpenEXR cannot write it: %s", path,
+                       exr_get_default_error_message(code));
+    code = set_header(w.file, &source->info, options->compression);
+    out_extent extent = out_extent_empty();
+    status = code == EXR_ERR_SUCCESS ? write_tiles(&w, options->run, &extent, error) : exr_failed(code, &to, error);
+    code = exr_finish(&w.file);
+    if (status == TL_OK && code != EXR_ERR_SUCCESS)
+        status = exr_failed(code, &to, error);
+    if (own.status != TL_OK && error)
+        *error = own;
+    return status == TL_OK ? patch_extent(output, &extent, error) : status;
+}

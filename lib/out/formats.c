@@ -1,0 +1,137 @@
+#include "lib/base/error.h"
+#include "lib/out/out.h"
+
+#include <assert.h>
+#include <errno.h>
+#include <fcntl.h>
+#include <string.h>
+#include <strings.h>
+#include <unistd.h>
+
+typedef tl_status (*grid_writer)(const tl_source *, tl_output *, const tl_write_options *, tl_error *);
+typedef tl_status (*mesh_writer)(const tl_mesh *, tl_output *, const tl_write_options *, tl_error *);
+
+/* One row a format. PNG16 writes two files and opens them itself. */
+static const struct writers {
+    const char *ending;
+    grid_writer grid;
+    mesh_writer mesh;
+    tl_status (*path)(const tl_source *, const char *, const tl_write_options *, tl_error *);
+} writers[] = {
+    {"exr", out_exr_write, NULL, NULL},      {"tif", out_geotiff_write, NULL, NULL},
+    {"tiff", out_geotiff_write, NULL, NULL}, {"png", NULL, NULL, out_png16_write},
+    {"glb", NULL, out_gltf_write, NULL},     {"obj", NULL, out_obj_write, NULL},
+    {"ply", NULL, out_ply_write, NULL},
+};
+
+/* In the order of `writers`. A mesh format takes grids too: as their full mesh. */
+static const tl_format formats[] = {
+    {"exr", "OpenEXR heightfield, 32-bit float, tiled", true, false},
+    {"tif", "GeoTIFF, 32-bit float, tiled", true, false},
+    {"tiff", "the same", true, false},
+    {"png", "16-bit grey PNG over the range of heights, with a JSON file beside it", true, false},
+    {"glb", "glTF 2.0 binary mesh", true, true},
+    {"obj", "Wavefront OBJ mesh", true, true},
+    {"ply", "binary PLY mesh", true, true},
+    {NULL, NULL, false, false},
+};
+_Static_assert(sizeof formats / sizeof *formats == sizeof writers / sizeof *writers + 1, "one writer a format");
+
+const tl_format *tl_formats(void)
+{
+    return formats;
+}
+
+const tl_format *tl_format_of(const char *path)
+{
+    const char *dot = strrchr(path, '.');
+    if (!dot || dot == path || dot[-1] == '/' || strchr(dot, '/'))
+        return NULL;
+    for (const tl_format *f = formats; f->ending; f++)
+        if (strcasecmp(dot + 1, f->ending) == 0)
+            return f;
+    return NULL;
+}
+
+static const struct writers *writers_of(const char *path, tl_error *error)
+{
+    const tl_format *format = tl_format_of(path);
+    if (!format) {
+        tl_fail(error, TL_ERROR_ARGUMENT, "%s: no format has this ending; use one of exr, tif, png, glb, obj, ply",
+                path);
+        return NULL;
+    }
+    const struct writers *found = &writers[format - formats];
+    assert(strcmp(found->ending, format->ending) == 0);
+    return found;
+}
+
+static tl_status finish(tl_output *output, tl_status status, tl_error *error)
+{
+    if (status == TL_OK)
+        return tl_output_commit(output, error);
+    tl_output_abort(output);
+    return status;
+}
+
+static const tl_write_options defaults;
+
+tl_status tl_write_mesh(const tl_mesh *mesh, const char *path, const tl_write_options *options, tl_error *error)
+{
+    options = options ? options : &defaults;
+    const struct writers *format = writers_of(path, error);
+    if (!format)
+        return TL_ERROR_ARGUMENT;
+    if (!format->mesh)
+        return tl_fail(error, TL_ERROR_ARGUMENT, "%s: .%s holds no meshes; use glb, obj or ply", path, format->ending);
+    tl_output *output = tl_output_open(path, options->overwrite, error);
+    if (!output)
+        return TL_ERROR_IO;
+    return finish(output, format->mesh(mesh, output, options, error), error);
+}
+
+static tl_status write_as_mesh(const tl_source *source, const char *path, const tl_write_options *options,
+                               tl_error *error)
+{
+    tl_output *output = tl_output_open(path, options->overwrite, error); /* refused before the work, not after it */
+    if (!output)
+        return TL_ERROR_IO;
+    tl_mesh *mesh = NULL;
+    tl_status status = tl_mesh_from_source(source, options->run, &mesh, error);
+    if (status == TL_OK)
+        status = writers_of(path, error)->mesh(mesh, output, options, error);
+    tl_mesh_destroy(mesh);
+    return finish(output, status, error);
+}
+
+tl_status tl_write_grid(const tl_source *source, const char *path, const tl_write_options *options, tl_error *error)
+{
+    options = options ? options : &defaults;
+    const struct writers *format = writers_of(path, error);
+    if (!format)
+        return TL_ERROR_ARGUMENT;
+    if (format->path)
+        return format->path(source, path, options, error);
+    if (format->mesh)
+        return write_as_mesh(source, path, options, error);
+    tl_output *output = tl_output_open(path, options->overwrite, error);
+    if (!output)
+        return TL_ERROR_IO;
+    return finish(output, format->grid(source, output, options, error), error);
+}
+
+tl_source *tl_open(const char *path, tl_error *error)
+{
+    static const unsigned char exr_magic[4] = {0x76, 0x2f, 0x31, 0x01};
+    unsigned char head[4] = {0};
+    int descriptor = open(path, O_RDONLY | O_CLOEXEC);
+    if (descriptor < 0) {
+        tl_fail_system(error, path, "read", errno);
+        return NULL;
+    }
+    ssize_t count = read(descriptor, head, sizeof head);
+    close(descriptor);
+    if (count == (ssize_t)sizeof head && memcmp(head, exr_magic, sizeof head) == 0)
+        return out_exr_open(path, error);
+    return tl_dem_open(path, NULL, error);
+}

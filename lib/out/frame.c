@@ -1,0 +1,137 @@
+#include "lib/out/frame.h"
+
+#include "dem/crs.h"
+#include "lib/base/error.h"
+
+#include <math.h>
+#include <stdlib.h>
+
+const char *const out_frame_names[] = {[TL_FRAME_DEFAULT] = "default",
+                                       [TL_FRAME_ENU] = "enu",
+                                       [TL_FRAME_PROJECTED] = "projected",
+                                       [TL_FRAME_PIXEL] = "pixel"};
+
+struct out_frame {
+    tl_frame kind;
+    const tl_georef *georef;
+    dem_projection *projection; /* of ENU frames */
+    dem_local_frame *local;
+    double origin[3];
+};
+
+static void position(const tl_georef *g, double i, double j, double *x, double *y)
+{
+    const double *t = g->transform;
+    *x = t[0] + t[1] * i + t[2] * j;
+    *y = t[3] + t[4] * i + t[5] * j;
+}
+
+/* The middle of the vertices' box at their middle height, so that float coordinates are small everywhere. */
+static void set_origin(out_frame *frame, const tl_mesh *mesh)
+{
+    double low[3] = {INFINITY, INFINITY, INFINITY}, high[3] = {-INFINITY, -INFINITY, -INFINITY};
+    for (size_t k = 0; k < mesh->vertex_count; k++) {
+        const double at[3] = {mesh->vertices[k].i, mesh->vertices[k].j, (double)mesh->vertices[k].z};
+        for (int a = 0; a < 3; a++) {
+            low[a] = fmin(low[a], at[a]);
+            high[a] = fmax(high[a], at[a]);
+        }
+    }
+    if (!mesh->vertex_count)
+        low[0] = low[1] = low[2] = high[0] = high[1] = high[2] = 0;
+    position(frame->georef, 0.5 * (low[0] + high[0]), 0.5 * (low[1] + high[1]), &frame->origin[0], &frame->origin[1]);
+    frame->origin[2] = 0.5 * (low[2] + high[2]) * frame->georef->height_unit;
+    dem_projection_to_lonlat(frame->projection, 1, &frame->origin[0], &frame->origin[1]);
+}
+
+static tl_status begin_enu(out_frame *frame, const tl_mesh *mesh, const char *path, tl_error *error)
+{
+    const tl_georef *g = frame->georef;
+    if (!g->crs || !g->located)
+        return tl_fail(error, TL_ERROR_ARGUMENT,
+                       "%s: where the raster lies is not known, so there is no east and north; use --frame projected",
+                       path);
+    frame->projection = dem_projection_create(g->crs, error);
+    if (!frame->projection)
+        return TL_ERROR_DATA;
+    set_origin(frame, mesh);
+    if (!isfinite(frame->origin[0]) || !isfinite(frame->origin[1]))
+        return tl_fail(error, TL_ERROR_DATA,
+                       "%s: the raster's middle has no longitude and latitude in %s; use --frame projected", path,
+                       tl_crs_name(g->crs));
+    frame->local = dem_local_frame_create(g->crs, frame->origin[0], frame->origin[1], frame->origin[2], error);
+    return frame->local ? TL_OK : TL_ERROR_DATA;
+}
+
+out_frame *out_frame_create(const tl_mesh *mesh, tl_frame kind, const char *path, tl_error *error)
+{
+    out_frame *frame = calloc(1, sizeof *frame);
+    if (!frame) {
+        tl_fail_memory(error, path);
+        return NULL;
+    }
+    frame->georef = &mesh->georef;
+    if (kind == TL_FRAME_DEFAULT)
+        kind = mesh->georef.crs && mesh->georef.located ? TL_FRAME_ENU : TL_FRAME_PROJECTED;
+    frame->kind = kind;
+    if (kind == TL_FRAME_ENU && begin_enu(frame, mesh, path, error) != TL_OK) {
+        out_frame_destroy(frame);
+        return NULL;
+    }
+    return frame;
+}
+
+void out_frame_destroy(out_frame *frame)
+{
+    if (!frame)
+        return;
+    dem_projection_destroy(frame->projection);
+    dem_local_frame_destroy(frame->local);
+    free(frame);
+}
+
+tl_frame out_frame_kind(const out_frame *frame)
+{
+    return frame->kind;
+}
+
+const double *out_frame_origin(const out_frame *frame)
+{
+    return frame->origin;
+}
+
+bool out_frame_faces_up(const out_frame *frame)
+{
+    const double *t = frame->georef->transform;
+    if (frame->kind == TL_FRAME_PIXEL)
+        return false; /* j runs down */
+    return t[1] * t[5] - t[2] * t[4] < 0;
+}
+
+enum { BATCH = 1024 };
+
+static void apply_enu(out_frame *frame, const tl_vertex *v, size_t n, double (*xyz)[3])
+{
+    double x[BATCH], y[BATCH];
+    for (size_t k = 0; k < n; k++)
+        position(frame->georef, v[k].i, v[k].j, &x[k], &y[k]);
+    dem_projection_to_lonlat(frame->projection, n, x, y);
+    for (size_t k = 0; k < n; k++)
+        dem_local_frame_forward(frame->local, x[k], y[k], (double)v[k].z * frame->georef->height_unit, xyz[k]);
+}
+
+void out_frame_apply(out_frame *frame, const tl_vertex *v, size_t n, double (*xyz)[3])
+{
+    if (frame->kind == TL_FRAME_ENU) {
+        for (size_t k = 0; k < n; k += BATCH)
+            apply_enu(frame, v + k, n - k < BATCH ? n - k : BATCH, xyz + k);
+        return;
+    }
+    for (size_t k = 0; k < n; k++) {
+        xyz[k][0] = v[k].i;
+        xyz[k][1] = v[k].j;
+        xyz[k][2] = (double)v[k].z;
+        if (frame->kind == TL_FRAME_PROJECTED)
+            position(frame->georef, v[k].i, v[k].j, &xyz[k][0], &xyz[k][1]);
+    }
+}

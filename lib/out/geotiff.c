@@ -1,0 +1,344 @@
+/* GeoTIFF: tiled float32 with deflate and the floating-point predictor. libtiff keeps the directory; tiles are
+ * predicted and compressed here, in parallel, and handed to it in order. */
+#include "dem/crs.h"
+#include "lib/base/error.h"
+#include "lib/base/parallel.h"
+#include "lib/base/size.h"
+#include "lib/out/out.h"
+
+#include <geotiff/geotiff.h>
+#include <geotiff/geotiffio.h>
+#include <geotiff/xtiffio.h>
+#include <libdeflate.h>
+#include <tiffio.h>
+
+#include <fcntl.h>
+#include <math.h>
+#include <stdio.h>
+#include <string.h>
+#include <unistd.h>
+
+enum {
+    TILE_BYTES = OUT_TILE * OUT_TILE * (int)sizeof(float),
+    DEFLATE_LEVEL = 6,
+    GDAL_METADATA = 42112, /* GDAL's private tags */
+    GDAL_NODATA = 42113,
+    METADATA_LIMIT = 16384,
+};
+
+/* Above this many bytes of heights the file is a BigTIFF: a classic one ends at 2^32, and deflate may grow data a
+ * little. */
+static const uint64_t classic_limit = UINT64_C(4000000000);
+
+static int no_message(TIFF *tiff, void *user, const char *module, const char *format, va_list list)
+{
+    (void)tiff;
+    (void)module;
+    tl_error *error = user;
+    if (error && error->status == TL_OK) {
+        vsnprintf(error->text, sizeof error->text, format, list);
+        error->status = TL_ERROR_IO;
+    }
+    return 1;
+}
+
+static tl_status tiff_failed(const char *path, const tl_error *said, tl_error *error)
+{
+    return tl_fail(error, TL_ERROR_IO, "%s: cannot write: %.300s", path,
+                   said->status != TL_OK ? said->text : "libtiff refused it");
+}
+
+/* ---- directory ---- */
+
+static void define_gdal_tags(TIFF *tiff)
+{
+    static const TIFFFieldInfo fields[] = {
+        {GDAL_METADATA, -1, -1, TIFF_ASCII, FIELD_CUSTOM, 1, 0, (char *)"GDALMetadata"},
+        {GDAL_NODATA, -1, -1, TIFF_ASCII, FIELD_CUSTOM, 1, 0, (char *)"GDALNoDataValue"},
+    };
+    TIFFMergeFieldInfo(tiff, fields, 2);
+}
+
+/* Appends text with XML's special characters replaced. */
+static void append_escaped(char *to, size_t *used, const char *text)
+{
+    for (; *text && *used + 8 < METADATA_LIMIT; text++) {
+        const char *entity = *text == '&'   ? "&amp;"
+                             : *text == '<' ? "&lt;"
+                             : *text == '>' ? "&gt;"
+                             : *text == '"' ? "&quot;"
+                                            : NULL;
+        if (entity) {
+            strcpy(to + *used, entity);
+            *used += strlen(entity);
+        } else
+            to[(*used)++] = *text;
+    }
+    to[*used] = '\0';
+}
+
+static void append_item(char *to, size_t *used, const char *name, const char *value)
+{
+    *used += (size_t)snprintf(to + *used, METADATA_LIMIT - *used, "  <Item name=\"talus_%.60s\">", name);
+    append_escaped(to, used, value);
+    *used += (size_t)snprintf(to + *used, METADATA_LIMIT - *used, "</Item>\n");
+}
+
+static bool set_metadata(TIFF *tiff, const tl_source_info *info)
+{
+    char *text = malloc(METADATA_LIMIT);
+    if (!text)
+        return false;
+    size_t used = (size_t)snprintf(text, METADATA_LIMIT, "<GDALMetadata>\n");
+    for (size_t i = 0; i < info->parameter_count && used + 1024 < METADATA_LIMIT; i++)
+        append_item(text, &used, info->parameters[i].name, info->parameters[i].value);
+    snprintf(text + used, METADATA_LIMIT - used, "</GDALMetadata>\n");
+    bool good = TIFFSetField(tiff, GDAL_METADATA, text) == 1;
+    free(text);
+    return good;
+}
+
+/* The keys that the CRS came with, but for the raster type, which is ours. */
+static bool copy_keys(GTIF *keys, const tl_crs *crs)
+{
+    const uint16_t *d = crs->key_directory;
+    bool good = true;
+    for (size_t at = 4; good && at + 4 <= crs->key_directory_count; at += 4) {
+        geokey_t id = (geokey_t)d[at];
+        size_t count = d[at + 2], offset = d[at + 3];
+        if (id == GTRasterTypeGeoKey)
+            continue;
+        if (d[at + 1] == 0)
+            good = GTIFKeySet(keys, id, TYPE_SHORT, 1, (int)offset) == 1;
+        else if (d[at + 1] == TIFFTAG_GEODOUBLEPARAMS && offset + count <= crs->key_double_count)
+            good = count == 1 ? GTIFKeySet(keys, id, TYPE_DOUBLE, 1, crs->key_doubles[offset]) == 1
+                              : GTIFKeySet(keys, id, TYPE_DOUBLE, (int)count, crs->key_doubles + offset) == 1;
+        else if (d[at + 1] == TIFFTAG_GEOASCIIPARAMS && crs->key_ascii && offset + count <= strlen(crs->key_ascii)) {
+            char *text = strndup(crs->key_ascii + offset, count ? count - 1 : 0); /* without the closing '|' */
+            good = text && GTIFKeySet(keys, id, TYPE_ASCII, 0, text) == 1;
+            free(text);
+        }
+    }
+    return good;
+}
+
+static bool set_code(GTIF *keys, const tl_crs *crs)
+{
+    bool good = GTIFKeySet(keys, GTModelTypeGeoKey, TYPE_SHORT, 1,
+                           crs->geographic ? ModelTypeGeographic : ModelTypeProjected) == 1;
+    if (good && crs->epsg > 0 && crs->epsg < 32767)
+        good = GTIFKeySet(keys, crs->geographic ? GeographicTypeGeoKey : ProjectedCSTypeGeoKey, TYPE_SHORT, 1,
+                          crs->epsg) == 1;
+    return good && GTIFKeySet(keys, GTCitationGeoKey, TYPE_ASCII, 0, crs->name) == 1;
+}
+
+static bool set_keys(TIFF *tiff, const tl_source_info *info)
+{
+    const tl_crs *crs = info->georef.crs;
+    GTIF *keys = GTIFNew(tiff);
+    if (!keys)
+        return false;
+    bool good = GTIFKeySet(keys, GTRasterTypeGeoKey, TYPE_SHORT, 1,
+                           info->type == TL_RASTER_AREA ? RasterPixelIsArea : RasterPixelIsPoint) == 1;
+    if (good && crs)
+        good = crs->key_directory_count ? copy_keys(keys, crs) : set_code(keys, crs);
+    good = good && GTIFWriteKeys(keys) == 1;
+    GTIFFree(keys);
+    return good;
+}
+
+/* Tie point and scale, or the whole matrix where rows and columns are not along the axes. A PixelIsPoint file ties the
+ * sample, a PixelIsArea one the corner of its cell. */
+static bool set_transform(TIFF *tiff, const tl_source_info *info)
+{
+    const double *t = info->georef.transform;
+    double margin = info->type == TL_RASTER_AREA ? 0.5 : 0;
+    double x = t[0] - margin * (t[1] + t[2]), y = t[3] - margin * (t[4] + t[5]);
+    if (t[2] == 0 && t[4] == 0 && t[1] > 0 && t[5] < 0) {
+        double scale[3] = {t[1], -t[5], 0}, tie[6] = {0, 0, 0, x, y, 0};
+        return TIFFSetField(tiff, TIFFTAG_GEOPIXELSCALE, 3, scale) == 1 &&
+               TIFFSetField(tiff, TIFFTAG_GEOTIEPOINTS, 6, tie) == 1;
+    }
+    double matrix[16] = {t[1], t[2], 0, x, t[4], t[5], 0, y, 0, 0, 0, 0, 0, 0, 0, 1};
+    return TIFFSetField(tiff, TIFFTAG_GEOTRANSMATRIX, 16, matrix) == 1;
+}
+
+static bool set_directory(TIFF *tiff, const tl_source_info *info, bool compress)
+{
+    define_gdal_tags(tiff);
+    bool good =
+        TIFFSetField(tiff, TIFFTAG_IMAGEWIDTH, (uint32_t)info->width) == 1 &&
+        TIFFSetField(tiff, TIFFTAG_IMAGELENGTH, (uint32_t)info->height) == 1 &&
+        TIFFSetField(tiff, TIFFTAG_TILEWIDTH, OUT_TILE) == 1 && TIFFSetField(tiff, TIFFTAG_TILELENGTH, OUT_TILE) == 1 &&
+        TIFFSetField(tiff, TIFFTAG_SAMPLESPERPIXEL, 1) == 1 && TIFFSetField(tiff, TIFFTAG_BITSPERSAMPLE, 32) == 1 &&
+        TIFFSetField(tiff, TIFFTAG_SAMPLEFORMAT, SAMPLEFORMAT_IEEEFP) == 1 &&
+        TIFFSetField(tiff, TIFFTAG_PLANARCONFIG, PLANARCONFIG_CONTIG) == 1 &&
+        TIFFSetField(tiff, TIFFTAG_PHOTOMETRIC, PHOTOMETRIC_MINISBLACK) == 1 &&
+        TIFFSetField(tiff, TIFFTAG_COMPRESSION, compress ? COMPRESSION_ADOBE_DEFLATE : COMPRESSION_NONE) == 1;
+    if (good && compress)
+        good = TIFFSetField(tiff, TIFFTAG_PREDICTOR, PREDICTOR_FLOATINGPOINT) == 1;
+    if (good && info->has_voids)
+        good = TIFFSetField(tiff, GDAL_NODATA, "nan") == 1;
+    if (good && info->georef.located)
+        good = set_transform(tiff, info);
+    if (good && (info->georef.located || info->georef.crs))
+        good = set_keys(tiff, info);
+    return good && (info->parameter_count == 0 || set_metadata(tiff, info));
+}
+
+/* ---- tiles ---- */
+
+/* TIFF's predictor 3: in each row the bytes of all samples by significance, highest first, then differences of
+ * neighbours. (Adobe Photoshop TIFF Technical Note 3.) */
+static void predict_rows(const float *heights, unsigned char *out)
+{
+    for (int row = 0; row < OUT_TILE; row++, heights += OUT_TILE, out += OUT_TILE * sizeof(float)) {
+        for (int i = 0; i < OUT_TILE; i++) {
+            uint32_t bits;
+            memcpy(&bits, &heights[i], sizeof bits);
+            for (int byte = 0; byte < 4; byte++)
+                out[byte * OUT_TILE + i] = (unsigned char)(bits >> (24 - 8 * byte));
+        }
+        for (int i = OUT_TILE * (int)sizeof(float) - 1; i > 0; i--)
+            out[i] = (unsigned char)(out[i] - out[i - 1]);
+    }
+}
+
+/* Spreads the rows of a narrower window over a whole tile, the last column and row repeated: what compresses best. */
+static void pad_tile(float *heights, tl_window window)
+{
+    for (int64_t row = window.height - 1; row >= 0; row--) {
+        float *to = heights + row * OUT_TILE;
+        memmove(to, heights + row * window.width, (size_t)window.width * sizeof *to);
+        for (int64_t i = window.width; i < OUT_TILE; i++)
+            to[i] = to[window.width - 1];
+    }
+    for (int64_t row = window.height; row < OUT_TILE; row++)
+        memcpy(heights + row * OUT_TILE, heights + (window.height - 1) * OUT_TILE, OUT_TILE * sizeof *heights);
+}
+
+typedef struct worker {
+    float *heights;
+    unsigned char *predicted, *packed;
+    struct libdeflate_compressor *compressor;
+} worker;
+
+typedef struct writing {
+    const tl_source *source;
+    const char *path;
+    TIFF *tiff;
+    out_tiling tiling;
+    bool compress;
+    size_t packed_limit;
+    worker *workers;
+    tl_error said; /* by libtiff */
+} writing;
+
+static bool worker_init(worker *self, const writing *w)
+{
+    self->heights = malloc(TILE_BYTES);
+    self->predicted = w->compress ? malloc(TILE_BYTES) : NULL;
+    self->packed = w->compress ? malloc(w->packed_limit) : NULL;
+    self->compressor = w->compress ? libdeflate_alloc_compressor(DEFLATE_LEVEL) : NULL;
+    return self->heights && (!w->compress || (self->predicted && self->packed && self->compressor));
+}
+
+static void worker_finish(worker *self)
+{
+    free(self->heights);
+    free(self->predicted);
+    free(self->packed);
+    if (self->compressor)
+        libdeflate_free_compressor(self->compressor);
+}
+
+static tl_status write_tile(void *context, tl_parallel *loop, uint64_t tile, unsigned index, tl_error *error)
+{
+    writing *w = context;
+    worker *self = &w->workers[index];
+    tl_window window = out_tile_window(&w->tiling, tile);
+    tl_status status = tl_source_read(w->source, w->source->info.level, window, self->heights, error);
+    if (status != TL_OK)
+        return status;
+    pad_tile(self->heights, window);
+    void *bytes = self->heights;
+    size_t count = TILE_BYTES;
+    if (w->compress) {
+        predict_rows(self->heights, self->predicted);
+        count = libdeflate_zlib_compress(self->compressor, self->predicted, TILE_BYTES, self->packed, w->packed_limit);
+        bytes = self->packed;
+    }
+    if (!tl_parallel_wait_turn(loop, tile))
+        return tl_fail(error, TL_ERROR_CANCELLED, "interrupted");
+    if (TIFFWriteRawTile(w->tiff, (uint32_t)tile, bytes, (tmsize_t)count) != (tmsize_t)count)
+        return tiff_failed(w->path, &w->said, error);
+    tl_parallel_end_turn(loop, tile);
+    return TL_OK;
+}
+
+static tl_status write_tiles(writing *w, const tl_run *run, tl_error *error)
+{
+    uint64_t tiles = (uint64_t)w->tiling.columns * (uint64_t)w->tiling.rows;
+    unsigned count = tl_parallel_workers(run, tiles);
+    tl_status status = TL_OK;
+    w->workers = calloc(count, sizeof *w->workers);
+    if (!w->workers)
+        return tl_fail_memory(error, w->path);
+    for (unsigned i = 0; i < count; i++)
+        if (!worker_init(&w->workers[i], w))
+            status = tl_fail_memory(error, w->path);
+    if (status == TL_OK)
+        status = tl_parallel_for(run, tiles, (uint64_t)(w->tiling.width * w->tiling.height), write_tile, w, error);
+    for (unsigned i = 0; i < count; i++)
+        worker_finish(&w->workers[i]);
+    free(w->workers);
+    return status;
+}
+
+/* libtiff on a copy of the descriptor, which it closes; its messages go to `said`. */
+static TIFF *open_tiff(tl_output *output, bool big, tl_error *said)
+{
+    TIFFOpenOptions *options = TIFFOpenOptionsAlloc();
+    int descriptor = options ? fcntl(tl_output_descriptor(output), F_DUPFD_CLOEXEC, 0) : -1;
+    TIFF *tiff = NULL;
+    if (descriptor >= 0) {
+        TIFFOpenOptionsSetErrorHandlerExtR(options, no_message, said);
+        TIFFOpenOptionsSetWarningHandlerExtR(options, no_message, NULL);
+        tiff = TIFFFdOpenExt(descriptor, tl_output_path(output), big ? "w8l" : "wl", options);
+        if (!tiff)
+            close(descriptor);
+    }
+    if (options)
+        TIFFOpenOptionsFree(options);
+    return tiff;
+}
+
+tl_status out_geotiff_write(const tl_source *source, tl_output *output, const tl_write_options *options,
+                            tl_error *error)
+{
+    const tl_source_info *info = &source->info;
+    writing w = {.source = source, .path = tl_output_path(output), .tiling = out_tiling_of(source)};
+    int64_t samples;
+    if (info->width > INT32_MAX || info->height > INT32_MAX || !tl_int64_mul(info->width, info->height, &samples) ||
+        w.tiling.columns * w.tiling.rows > INT32_MAX)
+        return tl_fail(error, TL_ERROR_ARGUMENT,
+                       "%s: %lld x %lld samples are too many for a TIFF; refine by fewer levels", w.path,
+                       (long long)info->width, (long long)info->height);
+    if (options->compression == TL_COMPRESSION_PIZ || options->compression == TL_COMPRESSION_ZIPS)
+        return tl_fail(error, TL_ERROR_ARGUMENT, "%s: piz and zips are compressions of EXR; use zip or none", w.path);
+    w.compress = options->compression != TL_COMPRESSION_NONE;
+    w.packed_limit = libdeflate_zlib_compress_bound(NULL, TILE_BYTES);
+    XTIFFInitialize();
+    w.tiff = open_tiff(output, (uint64_t)samples * sizeof(float) > classic_limit, &w.said);
+    if (!w.tiff)
+        return tiff_failed(w.path, &w.said, error);
+    tl_status status = set_directory(w.tiff, info, w.compress) ? write_tiles(&w, options->run, error)
+                                                               : tiff_failed(w.path, &w.said, error);
+    /* TIFFClose cannot fail, so what it would do is done here */
+    if (status == TL_OK && (!TIFFWriteDirectory(w.tiff) || w.said.status != TL_OK))
+        status = tiff_failed(w.path, &w.said, error);
+    XTIFFClose(w.tiff);
+    if (status == TL_OK && w.said.status != TL_OK)
+        status = tiff_failed(w.path, &w.said, error);
+    return status;
+}

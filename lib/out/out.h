@@ -1,0 +1,46 @@
+/* What the writers share: their table, and the record that goes with every output. */
+#ifndef OUT_OUT_H
+#define OUT_OUT_H
+
+#include "lib/base/output.h"
+#include "lib/talus.h"
+
+enum { OUT_TILE = 256 }; /* samples on a side of the tiles in which grids are pulled and stored */
+
+/* Writers of one format each. They write into an open output and leave committing and aborting to the caller. */
+tl_status out_exr_write(const tl_source *source, tl_output *output, const tl_write_options *options, tl_error *error);
+tl_status out_geotiff_write(const tl_source *source, tl_output *output, const tl_write_options *options,
+                            tl_error *error);
+tl_status out_gltf_write(const tl_mesh *mesh, tl_output *output, const tl_write_options *options, tl_error *error);
+tl_status out_obj_write(const tl_mesh *mesh, tl_output *output, const tl_write_options *options, tl_error *error);
+tl_status out_ply_write(const tl_mesh *mesh, tl_output *output, const tl_write_options *options, tl_error *error);
+/* Two files, `path` and its JSON sidecar, so this one opens its own outputs. */
+tl_status out_png16_write(const tl_source *source, const char *path, const tl_write_options *options, tl_error *error);
+
+/* Opens an EXR heightfield that out_exr_write wrote. */
+tl_source *out_exr_open(const char *path, tl_error *error);
+
+/* GDAL's geotransform of a source: from the outer corner of the first cell for area rasters; for point rasters of the
+ * cell whose centre the first sample is, as GDAL has it. */
+void out_gdal_transform(const tl_source_info *info, double out[6]);
+
+/* The tiles of a grid, row by row. */
+typedef struct out_tiling {
+    int64_t columns, rows;
+    int64_t width, height; /* of the grid */
+} out_tiling;
+
+out_tiling out_tiling_of(const tl_source *source);
+/* The window of a tile, cut at the grid's rim. */
+tl_window out_tile_window(const out_tiling *tiling, uint64_t tile);
+
+/* Lowest and highest height of what was written, gathered by worker. */
+typedef struct out_extent {
+    float low, high; /* low > high: no valid sample */
+} out_extent;
+
+out_extent out_extent_empty(void);
+void out_extent_add(out_extent *extent, const float *heights, size_t count);
+void out_extent_merge(out_extent *extent, const out_extent *other);
+
+#endif
