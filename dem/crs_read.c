@@ -16,6 +16,7 @@
 #include <proj_experimental.h>
 #include <stdio.h>
 #include <string.h>
+#include <strings.h>
 
 static const double degrees_per_radian = 57.295779513082320877;
 
@@ -306,19 +307,37 @@ static PJ *from_esri_text(PJ_CONTEXT *context, const dem_geokeys *keys)
     return crs;
 }
 
+/* The unit of length that ERDAS IMAGINE names in a citation, against which the code of the CRS does not count; 0 where
+ * there is none. */
+static double imagine_unit(const dem_geokeys *keys)
+{
+    static const struct {
+        const char *name;
+        double metres;
+    } units[] = {{"us_survey_feet", 1200.0 / 3937.0},
+                 {"us_survey_foot", 1200.0 / 3937.0},
+                 {"international_feet", 0.3048},
+                 {"international_foot", 0.3048},
+                 {"feet", 0.3048},
+                 {"meters", 1}};
+    static const char mark[] = "GeoTIFF Units = ";
+    const char *unit = strstr(keys->ascii, mark);
+    for (size_t k = 0; unit && k < sizeof units / sizeof *units; k++)
+        if (strncasecmp(unit + strlen(mark), units[k].name, strlen(units[k].name)) == 0)
+            return units[k].metres;
+    return 0;
+}
+
 static PJ *projected_from(PJ_CONTEXT *context, GTIFDefn *definition, const dem_geokeys *keys)
 {
     uint16_t code = 0, unit;
     char name[128] = "unknown";
     dem_geokeys_short(keys, ProjectedCSTypeGeoKey, &code);
     PJ *crs = is_code(code) ? from_code(context, code) : NULL;
+    if (crs && dem_geokeys_short(keys, ProjLinearUnitsGeoKey, &unit))
+        return with_unit(context, crs, definition->UOMLengthInMeters);
     if (crs)
-        return dem_geokeys_short(keys, ProjLinearUnitsGeoKey, &unit)
-                   ? with_unit(context, crs, definition->UOMLengthInMeters)
-                   : crs;
-    crs = from_esri_text(context, keys);
-    if (crs)
-        return crs;
+        return with_unit(context, crs, imagine_unit(keys));
     read_citation(keys, GTCitationGeoKey, "PCS Name = ", name, sizeof name);
     read_citation(keys, PCSCitationGeoKey, "PCS Name = ", name, sizeof name);
     /* written by ArcGIS with the parameters of the ellipsoidal Mercator, which it is not */
@@ -333,6 +352,9 @@ static PJ *from_definition(PJ_CONTEXT *context, GTIFDefn *definition, const dem_
     dem_geokeys_short(keys, GTModelTypeGeoKey, &model);
     dem_geokeys_short(keys, ProjectedCSTypeGeoKey, &projected);
     dem_geokeys_short(keys, GeographicTypeGeoKey, &geographic);
+    PJ *crs = is_code(projected) ? NULL : from_esri_text(context, keys);
+    if (crs)
+        return crs;
     if (model != ModelTypeProjected && model != ModelTypeGeographic)
         model = projected ? ModelTypeProjected : geographic ? ModelTypeGeographic : model;
     if (model == ModelTypeProjected)

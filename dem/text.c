@@ -1,5 +1,6 @@
 #include "dem/text.h"
 
+#include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -20,6 +21,12 @@ void dem_locale_leave(dem_locale locale)
     freelocale(locale.own);
 }
 
+/* What Microsoft's C library printed for numbers that are none: 1.#INF, -1.#IND, 1.#QNAN. */
+static double special_number(const char *mark, double sign)
+{
+    return strncmp(mark, "#INF", 4) == 0 ? sign * (double)INFINITY : (double)NAN;
+}
+
 bool dem_parse_number(const char *text, double *value)
 {
     char *end;
@@ -28,7 +35,7 @@ bool dem_parse_number(const char *text, double *value)
     dem_locale_leave(locale);
     if (end == text)
         return false;
-    *value = number;
+    *value = *end == '#' ? special_number(end, number) : number;
     return true;
 }
 

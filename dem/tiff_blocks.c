@@ -120,8 +120,8 @@ static tl_status decode_block(dem_blocks *blocks, const chunk *self, dem_tiff_ha
                               tl_error *error)
 {
     const dem_layout *layout = &blocks->layout;
-    int64_t rows = layout->tiled ? layout->block_height : self->rows;
-    tmsize_t bytes = (tmsize_t)(rows * layout->row_bytes);
+    /* rows of a tile below the raster's last are not asked for: some writers leave them out */
+    tmsize_t bytes = (tmsize_t)(self->rows * layout->row_bytes);
     char *raw = malloc((size_t)bytes);
     if (!raw)
         return tl_fail_memory(error, dem_tiff_file_path(blocks->file));

@@ -99,9 +99,14 @@ void dem_tiff_forget(dem_tiff_handle *handle)
     handle->message[0] = 0;
 }
 
+/* libtiff begins some messages with the file's name, which ours do already. */
 const char *dem_tiff_message(const dem_tiff_handle *handle, const char *otherwise)
 {
-    return handle->message[0] ? handle->message : otherwise;
+    const char *path = handle->file->path, *message = handle->message;
+    size_t length = strlen(path);
+    if (strncmp(message, path, length) == 0 && strncmp(message + length, ": ", 2) == 0)
+        message += length + 2;
+    return *message ? message : otherwise;
 }
 
 /* ---- Handles ---- */

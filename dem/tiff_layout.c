@@ -87,10 +87,8 @@ static tl_status read_sample_type(TIFF *tiff, const char *path, dem_layout *out,
     out->kind = format == SAMPLEFORMAT_INT      ? DEM_SAMPLE_INT
                 : format == SAMPLEFORMAT_IEEEFP ? DEM_SAMPLE_FLOAT
                                                 : DEM_SAMPLE_UINT;
-    bool whole = bits == 8 || bits == 16 || bits == 32 || bits == 64;
-    bool fine = out->kind == DEM_SAMPLE_UINT  ? whole || (bits >= 1 && bits < 32)
-                : out->kind == DEM_SAMPLE_INT ? whole
-                                              : bits == 16 || bits == 24 || bits == 32 || bits == 64;
+    bool fine = out->kind == DEM_SAMPLE_FLOAT ? bits == 16 || bits == 24 || bits == 32 || bits == 64
+                                              : (bits >= 1 && bits <= 32) || bits == 64;
     if (!fine)
         return tl_fail(error, TL_ERROR_DATA,
                        "%s: samples of %d bits of TIFF sample format %d cannot be read; convert them to float32", path,

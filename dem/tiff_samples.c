@@ -67,14 +67,26 @@ static double small_float(uint32_t word, int exponent_bits, int mantissa_bits)
     return word >> (exponent_bits + mantissa_bits) ? -size : size;
 }
 
-/* Three bytes, which libtiff gives least significant first on machines that are so, in files of either order. */
-static uint32_t three_bytes(const unsigned char *bytes)
+static bool machine_is_little_endian(void)
 {
     const uint16_t one = 1;
     unsigned char first;
     memcpy(&first, &one, 1);
-    return first ? bytes[0] | (uint32_t)bytes[1] << 8 | (uint32_t)bytes[2] << 16
-                 : bytes[2] | (uint32_t)bytes[1] << 8 | (uint32_t)bytes[0] << 16;
+    return first;
+}
+
+static uint32_t three_bytes(const unsigned char *bytes, bool lowest_first)
+{
+    return lowest_first ? bytes[0] | (uint32_t)bytes[1] << 8 | (uint32_t)bytes[2] << 16
+                        : bytes[2] | (uint32_t)bytes[1] << 8 | (uint32_t)bytes[0] << 16;
+}
+
+/* 24 bits. Floats have the file's byte order; integers are bit strings, the highest first, in files of either order.
+ * libtiff takes both for numbers and swaps their bytes in files of the other order than the machine's. */
+static uint32_t word24(const dem_layout *layout, const unsigned char *bytes)
+{
+    bool little = machine_is_little_endian();
+    return three_bytes(bytes, layout->kind == DEM_SAMPLE_FLOAT ? little : little == layout->big_endian);
 }
 
 /* Samples that are not whole bytes follow each other bit by bit, the highest first. */
@@ -88,18 +100,24 @@ static uint32_t packed_bits(const unsigned char *row, size_t first_bit, int bits
     return (uint32_t)(word & ((UINT64_C(1) << bits) - 1));
 }
 
+/* The number that the lowest `bits` of a word are in two's complement. */
+static double signed_value(uint32_t word, int bits)
+{
+    return word >> (bits - 1) ? (double)word - ldexp(1, bits) : (double)word;
+}
+
 static double odd_sample(const dem_layout *layout, const unsigned char *row, size_t index)
 {
-    if (layout->bits == 24) {
-        uint32_t word = three_bytes(row + 3 * index);
-        return layout->kind == DEM_SAMPLE_FLOAT ? small_float(word, 7, 16) : (double)word;
-    }
-    if (layout->kind == DEM_SAMPLE_FLOAT) {
-        uint16_t half;
+    int bits = layout->bits;
+    uint16_t half;
+    if (layout->kind == DEM_SAMPLE_FLOAT && bits == 16) {
         memcpy(&half, row + 2 * index, sizeof half);
         return small_float(half, 5, 10);
     }
-    return packed_bits(row, index * (size_t)layout->bits, layout->bits);
+    uint32_t word = bits == 24 ? word24(layout, row + 3 * index) : packed_bits(row, index * (size_t)bits, bits);
+    if (layout->kind == DEM_SAMPLE_FLOAT)
+        return small_float(word, 7, 16);
+    return layout->kind == DEM_SAMPLE_INT ? signed_value(word, bits) : (double)word;
 }
 
 void dem_samples_to_heights(const dem_layout *layout, const void *row, size_t count, float *heights)
