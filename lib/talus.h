@@ -338,8 +338,9 @@ typedef struct tl_write_options {
 } tl_write_options;
 
 /* Writes the finest level of a source to `path`, in the format of its ending (EXR, GeoTIFF, 16-bit PNG with a
- * JSON file beside it, or a full mesh). Tiles are made in parallel and written as they come, so memory does not
- * grow with the output. The file appears under its name only when it is complete. */
+ * JSON file beside it, or a full mesh). EXR and PNG have the north in their first row, whatever the order of the
+ * source; GeoTIFF keeps the source's. Tiles are made in parallel and written as they come, so memory does not grow with
+ * the output. The file appears under its name only when it is complete. */
 TL_API tl_status tl_write_grid(const tl_source *source, const char *path, const tl_write_options *options,
                                tl_error *error);
 /* Writes a mesh to `path` (GLB, OBJ or PLY by its ending). */

@@ -1,5 +1,6 @@
 #include "lib/base/error.h"
 #include "lib/out/out.h"
+#include "lib/scene/north_up.h"
 
 #include <assert.h>
 #include <errno.h>
@@ -11,17 +12,19 @@
 typedef tl_status (*grid_writer)(const tl_source *, tl_output *, const tl_write_options *, tl_error *);
 typedef tl_status (*mesh_writer)(const tl_mesh *, tl_output *, const tl_write_options *, tl_error *);
 
-/* One row a format. PNG16 writes two files and opens them itself. */
+/* One row a format. PNG16 writes two files and opens them itself. A picture is read by its rows, without georeference,
+ * so its first row is the north. */
 static const struct writers {
     const char *ending;
+    bool picture;
     grid_writer grid;
     mesh_writer mesh;
     tl_status (*path)(const tl_source *, const char *, const tl_write_options *, tl_error *);
 } writers[] = {
-    {"exr", out_exr_write, NULL, NULL},      {"tif", out_geotiff_write, NULL, NULL},
-    {"tiff", out_geotiff_write, NULL, NULL}, {"png", NULL, NULL, out_png16_write},
-    {"glb", NULL, out_gltf_write, NULL},     {"obj", NULL, out_obj_write, NULL},
-    {"ply", NULL, out_ply_write, NULL},
+    {"exr", true, out_exr_write, NULL, NULL},       {"tif", false, out_geotiff_write, NULL, NULL},
+    {"tiff", false, out_geotiff_write, NULL, NULL}, {"png", true, NULL, NULL, out_png16_write},
+    {"glb", false, NULL, out_gltf_write, NULL},     {"obj", false, NULL, out_obj_write, NULL},
+    {"ply", false, NULL, out_ply_write, NULL},
 };
 
 /* In the order of `writers`. A mesh format takes grids too: as their full mesh. */
@@ -104,20 +107,31 @@ static tl_status write_as_mesh(const tl_source *source, const char *path, const 
     return finish(output, status, error);
 }
 
+static tl_status write_rows(const struct writers *format, const tl_source *source, const char *path,
+                            const tl_write_options *options, tl_error *error)
+{
+    if (format->path)
+        return format->path(source, path, options, error);
+    tl_output *output = tl_output_open(path, options->overwrite, error);
+    if (!output)
+        return TL_ERROR_IO;
+    return finish(output, format->grid(source, output, options, error), error);
+}
+
 tl_status tl_write_grid(const tl_source *source, const char *path, const tl_write_options *options, tl_error *error)
 {
     options = options ? options : &defaults;
     const struct writers *format = writers_of(path, error);
     if (!format)
         return TL_ERROR_ARGUMENT;
-    if (format->path)
-        return format->path(source, path, options, error);
     if (format->mesh)
         return write_as_mesh(source, path, options, error);
-    tl_output *output = tl_output_open(path, options->overwrite, error);
-    if (!output)
-        return TL_ERROR_IO;
-    return finish(output, format->grid(source, output, options, error), error);
+    if (!format->picture)
+        return write_rows(format, source, path, options, error);
+    tl_source *upright = scene_north_up(source, error);
+    tl_status status = upright ? write_rows(format, upright, path, options, error) : TL_ERROR_MEMORY;
+    tl_source_destroy(upright);
+    return status;
 }
 
 tl_source *tl_open(const char *path, tl_error *error)

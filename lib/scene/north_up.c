@@ -1,0 +1,84 @@
+#include "lib/scene/north_up.h"
+
+#include "lib/base/error.h"
+#include "lib/base/size.h"
+
+typedef struct north_up {
+    tl_source source;
+    const tl_source *original;
+    bool rows, columns; /* whether they run backwards */
+} north_up;
+
+static void reverse(float *heights, int64_t count)
+{
+    for (int64_t i = 0, j = count - 1; i < j; i++, j--) {
+        float swapped = heights[i];
+        heights[i] = heights[j];
+        heights[j] = swapped;
+    }
+}
+
+static void swap_rows(float *a, float *b, int64_t width)
+{
+    for (int64_t i = 0; i < width; i++) {
+        float swapped = a[i];
+        a[i] = b[i];
+        b[i] = swapped;
+    }
+}
+
+static tl_status north_up_read(const tl_source *self, int level, tl_window window, float *out, tl_error *error)
+{
+    const north_up *n = (const north_up *)self;
+    int64_t width, height;
+    tl_status status = tl_source_size(n->original, level, &width, &height, error);
+    if (status != TL_OK)
+        return status;
+    if (n->columns)
+        window.x = width - window.x - window.width;
+    if (n->rows)
+        window.y = height - window.y - window.height;
+    status = tl_source_read(n->original, level, window, out, error);
+    if (status != TL_OK)
+        return status;
+    for (int64_t y = 0; n->columns && y < window.height; y++)
+        reverse(out + y * window.width, window.width);
+    for (int64_t y = 0; n->rows && y < window.height / 2; y++)
+        swap_rows(out + y * window.width, out + (window.height - 1 - y) * window.width, window.width);
+    return TL_OK;
+}
+
+static tl_status north_up_size(const tl_source *self, int level, int64_t *width, int64_t *height, tl_error *error)
+{
+    return tl_source_size(((const north_up *)self)->original, level, width, height, error);
+}
+
+static void north_up_destroy(tl_source *self)
+{
+    free(self);
+}
+
+tl_source *scene_north_up(const tl_source *source, tl_error *error)
+{
+    north_up *n = calloc(1, sizeof *n);
+    if (!n) {
+        tl_fail_memory(error, source->info.name);
+        return NULL;
+    }
+    n->source =
+        (tl_source){.info = source->info, .read = north_up_read, .size = north_up_size, .destroy = north_up_destroy};
+    n->original = source;
+    double *t = n->source.info.georef.transform;
+    bool upright = t[2] == 0 && t[4] == 0;
+    n->columns = upright && t[1] < 0;
+    n->rows = upright && t[5] > 0;
+    if (n->columns) {
+        t[0] += t[1] * (double)(source->info.width - 1);
+        t[1] = -t[1];
+    }
+    if (n->rows) {
+        t[3] += t[5] * (double)(source->info.height - 1);
+        t[5] = -t[5];
+    }
+    return &n->source;
+}
