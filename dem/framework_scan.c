@@ -2,6 +2,7 @@
 #include "dem/framework.h"
 
 #include <math.h>
+#include <string.h>
 
 static const float NEEDED = INFINITY, NOTHING = -INFINITY;
 
@@ -115,11 +116,15 @@ static inline float larger4(float a, float b, float c, float d)
     return m > n ? m : n;
 }
 
-/* As a float that is not smaller. */
+/* A float that is not smaller than `bound` >= 0, without a branch: the bits of floats are ordered as they are. */
 static inline float rounded_up(double bound)
 {
     float f = (float)bound;
-    return (double)f < bound ? nextafterf(f, INFINITY) : f;
+    uint32_t bits;
+    memcpy(&bits, &f, sizeof bits);
+    bits += (double)f < bound;
+    memcpy(&f, &bits, sizeof f);
+    return f;
 }
 
 /* The bound of a vertex whose triangles have this error, or NEEDED. What overflowed (or is infinity less infinity)
@@ -332,16 +337,16 @@ static inline void sample_down(const tl_patch *patch, int64_t y, float *out, boo
 
 /* A triangle around a centre of stage 1 covers, beside its corners, the centre and the midpoints of its legs, whose
  * errors are those of the edge points: the largest is its error, exactly. */
-static inline float sample_centre(const float *z, int64_t end, float children, double limit, bool careful)
+static inline float sample_centre(const float *z, int64_t end, float children, double limit, bool careful, bool voids)
 {
-    if (isinf(children))
-        return children;
+    if (voids && children == NOTHING)
+        return NOTHING;
     double error = midpoint_error((double)z[-end], (double)z[0], (double)z[end], careful);
-    return settled(larger((double)children, error), limit);
+    return settled(larger(error, (double)children), limit);
 }
 
 static inline void sample_centres(const tl_patch *patch, int64_t row, const float *above, const float *below,
-                                  const float *left, bool careful)
+                                  const float *left, bool careful, bool voids)
 {
     int64_t columns = tl_patch_squares(patch->width, 1), y = 2 * row + 1, stride = patch->stride;
     const float *z = patch->heights + y * stride + 1;
@@ -350,7 +355,7 @@ static inline void sample_centres(const tl_patch *patch, int64_t row, const floa
     for (int64_t i = 0; i < columns; i++) {
         float children = larger4(above[i], below[i], left[i], left[i + 1]);
         int64_t end = stride + (is_rising(patch, i, row, 1) ? -1 : 1);
-        out[i] = sample_centre(z + 2 * i, end, children, patch->max_error, careful);
+        out[i] = sample_centre(z + 2 * i, end, children, patch->max_error, careful, voids);
         split[2 * i] = out[i] == NEEDED;
     }
     if (2 * columns > patch->rim_x) {
@@ -371,7 +376,7 @@ static inline void decide_samples(tl_patch *patch, float *rows, bool careful, bo
     for (int64_t row = 0; row < count; row++) {
         sample_down(patch, 2 * row + 1, down, careful, voids);
         sample_across(patch, 2 * row + 2, below, careful, voids);
-        sample_centres(patch, row, above, below, down, careful);
+        sample_centres(patch, row, above, below, down, careful, voids);
         float *swap = above;
         above = below;
         below = swap;
