@@ -3,14 +3,10 @@
 #ifndef FBM_EXACT_H
 #define FBM_EXACT_H
 
+#include "fbm/status.h"
+
 #include <stddef.h>
 #include <stdint.h>
-
-typedef enum fbm_status {
-    FBM_OK = 0,
-    FBM_NO_MEMORY, /* the system refused the memory that fbm_exact_memory states */
-    FBM_TOO_LARGE, /* the size is beyond FBM_EXACT_SIZE_MAX or cannot be addressed */
-} fbm_status;
 
 /* Largest side, for which fbm_exact takes 10 GB (hurst <= 0.75) or 30 GB. */
 #define FBM_EXACT_SIZE_MAX 16384
@@ -22,7 +18,8 @@ size_t fbm_exact_memory(size_t size, double hurst);
 /* Writes a size x size field to out[size * size], with Gaussian increments of mean 0 and
  * E|Z(x + h) - Z(x)|^2 = delta^2 |h|^(2H), h in samples, for every pair of samples. Z is 0 at the first sample.
  *
- * hurst is clamped to [0.01, 0.99]; size >= 1. On failure out is untouched. */
+ * hurst is clamped to [0.01, 0.99]; size >= 1. FBM_TOO_LARGE where fbm_exact_memory is 0. On failure out is untouched.
+ */
 fbm_status fbm_exact(size_t size, double hurst, double delta, uint64_t seed, float *out);
 
 #endif

@@ -53,7 +53,7 @@ fbm_window fbm_centres_support(const fbm_scheme *scheme, fbm_window cells)
 /* ---- The walk ---------------------------------------------------------------------------------- */
 
 /* Columns of cells that are made at a time: 23 rows of scratch and the rows of the input then stay in a first-level
- * cache of 32 KiB. Measured: see tests/bench/bench_refine.c. */
+ * cache of 32 KiB. See tests/bench/bench_refine.c. */
 enum { STRIP = 256, RING = 4, MARGIN = 8, PARTIALS = 5, ROWS = 4 * RING + PARTIALS + 1 };
 
 /* Floats of a scratch row for n cells. Odd multiples of a cache line, lest the rows fall into the same few sets. */

@@ -1,0 +1,298 @@
+#include "fbm/covariance.h"
+
+#include "fbm/kernel.h"
+
+#include <math.h>
+#include <stdbool.h>
+#include <stdlib.h>
+#include <string.h>
+
+enum { LEVELS = 6, CELLS = 8, SIDE = 129, DIRECTIONS = 8 };
+
+static const int directions[DIRECTIONS][2] = {{1, 0}, {0, 1}, {1, 1}, {1, -1}, {2, 1}, {2, -1}, {1, 2}, {1, -2}};
+
+typedef struct analysis {
+    fbm_kernel kernel; /* whose noise is one impulse */
+    fbm_step step;
+    double hurst;
+    int levels;
+    fbm_window window[LEVELS + 1]; /* of every level; the last is the window looked at */
+    float *heights[LEVELS + 1];
+    float *scratch;
+    int side, lags;    /* samples of the last window; lags looked at */
+    size_t inputs;     /* samples of the first window */
+    double *responses; /* [side * side][inputs]: of a sample to each input */
+    double *products;  /* the same times the covariance of the inputs */
+    double *variances; /* [direction][lag - 1][side * side]: of the increment that starts there */
+} analysis;
+
+/* ---- Impulses ---------------------------------------------------------------------------------- */
+
+/* Noise that is 1 at one point and 0 elsewhere. The point travels in the seed: kind, row and column + 2^20. */
+enum { BIAS = 1 << 20 };
+
+static uint64_t impulse_seed(fbm_noise_kind kind, int64_t row, int64_t column)
+{
+    return (uint64_t)kind << 60 | (uint64_t)(row + BIAS) << 30 | (uint64_t)(column + BIAS);
+}
+
+static void impulse_noise(uint64_t seed, int32_t level, fbm_noise_kind kind, int64_t row, int64_t first, size_t count,
+                          float *out)
+{
+    (void)level;
+    memset(out, 0, count * sizeof *out);
+    int64_t column = (int64_t)(seed & 0x3fffffff) - BIAS;
+    bool here = kind == (fbm_noise_kind)(seed >> 60) && row == (int64_t)(seed >> 30 & 0x3fffffff) - BIAS;
+    if (here && column >= first && column - first < (int64_t)count)
+        out[column - first] = 1;
+}
+
+/* Refines from level `first` to the last; the noise impulse, if any, is in that first step. */
+static void run(analysis *a, int first, float amplitude, uint64_t seed)
+{
+    a->step.seed = seed;
+    a->step.amplitude = amplitude;
+    for (int l = first; l < a->levels; l++) {
+        fbm_refine_by(&a->kernel, &a->step, a->heights[l], a->window[l], a->heights[l + 1], a->window[l + 1],
+                      a->scratch);
+        a->step.amplitude = 0;
+    }
+}
+
+static size_t samples(fbm_window window)
+{
+    return window.width * window.height;
+}
+
+static void clear(analysis *a, int level)
+{
+    memset(a->heights[level], 0, samples(a->window[level]) * sizeof(float));
+}
+
+/* ---- Inputs ------------------------------------------------------------------------------------ */
+
+static void input_responses(analysis *a)
+{
+    size_t points = (size_t)a->side * (size_t)a->side;
+    const float *last = a->heights[a->levels];
+    clear(a, 0);
+    for (size_t k = 0; k < a->inputs; k++) {
+        a->heights[0][k] = 1;
+        run(a, 0, 0, 0);
+        for (size_t p = 0; p < points; p++)
+            a->responses[p * a->inputs + k] = (double)last[p];
+        a->heights[0][k] = 0;
+    }
+    /* The covariance below holds for contrasts only, and grows with distance: what float leaves of the sum of the
+     * responses beyond 1 would count as a contrast with something far away. */
+    for (size_t p = 0; p < points; p++) {
+        double *row = a->responses + p * a->inputs, sum = 0;
+        for (size_t k = 0; k < a->inputs; k++)
+            sum += row[k];
+        for (size_t k = 0; k < a->inputs; k++)
+            row[k] /= sum;
+    }
+}
+
+/* Generalised covariance -|h|^(2H) / 2 of vertices k and m of level 0. */
+static double covariance(const analysis *a, size_t k, size_t m)
+{
+    size_t width = a->window[0].width;
+    double dx = (double)(k % width) - (double)(m % width), dy = (double)(k / width) - (double)(m / width);
+    double square = dx * dx + dy * dy;
+    return square > 0 ? -0.5 * pow(square, a->hurst) : 0;
+}
+
+static bool multiply_covariance(analysis *a)
+{
+    size_t n = a->inputs, points = (size_t)a->side * (size_t)a->side;
+    double *matrix = malloc(n * n * sizeof *matrix);
+    if (!matrix)
+        return false;
+    for (size_t k = 0; k < n; k++)
+        for (size_t m = 0; m < n; m++)
+            matrix[k * n + m] = covariance(a, k, m);
+    memset(a->products, 0, points * n * sizeof *a->products);
+    for (size_t p = 0; p < points; p++)
+        for (size_t k = 0; k < n; k++) {
+            double response = a->responses[p * n + k], *product = a->products + p * n;
+            for (size_t m = 0; response != 0 && m < n; m++)
+                product[m] += response * matrix[k * n + m];
+        }
+    free(matrix);
+    return true;
+}
+
+/* ---- Increments -------------------------------------------------------------------------------- */
+
+typedef struct box {
+    int x0, y0, x1, y1; /* inclusive */
+} box;
+
+static int least(int a, int b)
+{
+    return a < b ? a : b;
+}
+
+static int most(int a, int b)
+{
+    return a > b ? a : b;
+}
+
+/* Calls visit(a, offset in the variances, p, q) for every increment from p to q of which an end may lie in `in`. */
+static void each_increment(analysis *a, box in, void (*visit)(analysis *, size_t, size_t, size_t))
+{
+    int n = a->side;
+    for (int d = 0; d < DIRECTIONS; d++)
+        for (int lag = 1; lag <= a->lags; lag++) {
+            int dx = lag * directions[d][0], dy = lag * directions[d][1];
+            size_t base = (size_t)(d * a->lags + lag - 1) * (size_t)n * (size_t)n;
+            int y0 = most(most(0, -dy), least(in.y0, in.y0 - dy)),
+                y1 = least(n - 1 - most(0, dy), most(in.y1, in.y1 - dy));
+            int x0 = most(0, in.x0 - dx), x1 = least(n - 1 - dx, in.x1);
+            for (int y = y0; y <= y1; y++)
+                for (int x = x0; x <= x1; x++) {
+                    size_t p = (size_t)y * (size_t)n + (size_t)x;
+                    visit(a, base + p, p, (size_t)((y + dy) * n + x + dx));
+                }
+        }
+}
+
+static void add_input_variance(analysis *a, size_t at, size_t p, size_t q)
+{
+    size_t n = a->inputs;
+    const double *rp = a->responses + p * n, *rq = a->responses + q * n;
+    const double *cp = a->products + p * n, *cq = a->products + q * n;
+    double sum = 0;
+    for (size_t k = 0; k < n; k++)
+        sum += (rp[k] - rq[k]) * (cp[k] - cq[k]);
+    a->variances[at] += sum;
+}
+
+static void add_noise_variance(analysis *a, size_t at, size_t p, size_t q)
+{
+    const float *last = a->heights[a->levels];
+    double contrast = (double)last[p] - (double)last[q];
+    a->variances[at] += contrast * contrast;
+}
+
+/* The box of the samples that are not 0; false where all are. */
+static bool bounds(const analysis *a, box *out)
+{
+    const float *last = a->heights[a->levels];
+    *out = (box){a->side, a->side, -1, -1};
+    for (int y = 0; y < a->side; y++)
+        for (int x = 0; x < a->side; x++)
+            if (last[y * a->side + x] != 0)
+                *out = (box){least(out->x0, x), least(out->y0, y), most(out->x1, x), most(out->y1, y)};
+    return out->x1 >= 0;
+}
+
+/* Every noise value of the step from `level` that may be seen; those beyond give no response. */
+static void add_noise(analysis *a, int level)
+{
+    fbm_window w = a->window[level];
+    float amplitude = (float)pow(2, -level * a->hurst);
+    clear(a, level);
+    for (int kind = FBM_NOISE_CENTRES; kind <= FBM_NOISE_COLUMN_EDGES; kind++)
+        for (int64_t j = w.j - 1; j < w.j + (int64_t)w.height; j++)
+            for (int64_t i = w.i - 1; i < w.i + (int64_t)w.width; i++) {
+                box seen;
+                run(a, level, amplitude, impulse_seed((fbm_noise_kind)kind, j, i));
+                if (bounds(a, &seen))
+                    each_increment(a, seen, add_noise_variance);
+            }
+}
+
+/* ---- Result ------------------------------------------------------------------------------------ */
+
+static void summarise(const analysis *a, fbm_deviation *out)
+{
+    int n = a->side;
+    double lowest = INFINITY, highest = 0;
+    *out = (fbm_deviation){.ratio = 1};
+    for (int d = 0; d < DIRECTIONS; d++)
+        for (int lag = 1; lag <= a->lags; lag++) {
+            int dx = lag * directions[d][0], dy = lag * directions[d][1];
+            double length = hypot(dx, dy) / (1 << a->levels), theory = pow(length, 2 * a->hurst);
+            double low = INFINITY, high = 0, sum = 0;
+            const double *v = a->variances + (size_t)(d * a->lags + lag - 1) * (size_t)n * (size_t)n;
+            for (int y = most(0, -dy); y < n - most(0, dy); y++)
+                for (int x = 0; x < n - dx; x++) {
+                    double relative = v[y * n + x] / theory;
+                    low = fmin(low, relative);
+                    high = fmax(high, relative);
+                    sum += relative;
+                }
+            double mean = sum / ((double)(n - dx) * (n - abs(dy)));
+            out->point = fmax(out->point, fmax(fabs(low - 1), fabs(high - 1)));
+            out->mean = fmax(out->mean, fabs(mean - 1));
+            out->ratio = fmax(out->ratio, high / low);
+            lowest = fmin(lowest, mean);
+            highest = fmax(highest, mean);
+        }
+    out->mean_scaled = (highest - lowest) / (highest + lowest);
+}
+
+static bool allocate(analysis *a)
+{
+    size_t points = (size_t)a->side * (size_t)a->side;
+    bool good = true;
+    for (int l = 0; l <= a->levels; l++) {
+        a->heights[l] = malloc(samples(a->window[l]) * sizeof(float));
+        good = good && a->heights[l];
+    }
+    size_t scratch = 0;
+    for (int l = 1; l <= a->levels; l++)
+        if (fbm_refine_scratch(a->window[l].width) > scratch)
+            scratch = fbm_refine_scratch(a->window[l].width);
+    a->scratch = malloc(scratch * sizeof(float));
+    a->responses = malloc(points * a->inputs * sizeof(double));
+    a->products = malloc(points * a->inputs * sizeof(double));
+    a->variances = calloc(points * DIRECTIONS * (size_t)a->lags, sizeof(double));
+    return good && a->scratch && a->responses && a->products && a->variances;
+}
+
+static void release(analysis *a)
+{
+    for (int l = 0; l <= a->levels; l++)
+        free(a->heights[l]);
+    free(a->scratch);
+    free(a->responses);
+    free(a->products);
+    free(a->variances);
+}
+
+static void plan(analysis *a, int cells)
+{
+    a->side = (cells << a->levels) + 1;
+    a->lags = most(1, (a->side - 1) / 4);
+    size_t side = (size_t)a->side;
+    a->window[a->levels] = (fbm_window){0, 0, side, side, side};
+    for (int l = a->levels; l > 0; l--)
+        a->window[l - 1] = fbm_refine_support(a->step.scheme, a->window[l]);
+    a->inputs = samples(a->window[0]);
+    a->kernel = *fbm_kernels()[0];
+    a->kernel.noise = impulse_noise;
+}
+
+fbm_status fbm_structure_deviation(const fbm_scheme *scheme, const fbm_weights *weights, double hurst, int levels,
+                                   int cells, fbm_deviation *out)
+{
+    if (levels < 1 || levels > LEVELS || cells < 1 || cells > CELLS || cells << levels >= SIDE)
+        return FBM_TOO_LARGE;
+    analysis a = {.step = {.scheme = scheme, .weights = *weights}, .hurst = hurst, .levels = levels};
+    plan(&a, cells);
+    bool good = allocate(&a);
+    if (good)
+        input_responses(&a);
+    good = good && multiply_covariance(&a);
+    if (good) {
+        each_increment(&a, (box){0, 0, a.side - 1, a.side - 1}, add_input_variance);
+        for (int l = 0; l < levels; l++)
+            add_noise(&a, l);
+        summarise(&a, out);
+    }
+    release(&a);
+    return good ? FBM_OK : FBM_NO_MEMORY;
+}

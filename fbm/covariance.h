@@ -1,0 +1,26 @@
+/* How far a refinement scheme's statistics are from fractional Brownian motion, computed, not sampled. */
+#ifndef FBM_COVARIANCE_H
+#define FBM_COVARIANCE_H
+
+#include "fbm/refine.h"
+#include "fbm/status.h"
+
+/* Deviations of the structure function S(h) = E|Z(x + h) - Z(x)|^2 from |h|^(2H), as fractions of it, over all
+ * multiples of (1, 0), (1, 1), (2, 1) and their mirror images up to a quarter of the window. */
+typedef struct fbm_deviation {
+    double point;       /* largest |S / theory - 1| at any position and lag */
+    double mean;        /* the same of S averaged over the positions */
+    double mean_scaled; /* the same after the best single factor on all of S */
+    double ratio;       /* largest over smallest S of one lag and direction, by position; 1 for stationary increments */
+} fbm_deviation;
+
+/* Starts from exact fBm on the vertices of level 0, refines it `levels` times (1 ... 6) and looks at a window of
+ * `cells` cells of level 0 (1 ... 8, at most 128 samples wide). The refinement is known by its impulse responses alone:
+ * every input sample and every noise value that the window sees is set to 1 in turn and sent through fbm_refine, so
+ * that what is analysed is what runs. The variance of an increment follows exactly, to rounding.
+ *
+ * FBM_TOO_LARGE outside of these ranges. */
+fbm_status fbm_structure_deviation(const fbm_scheme *scheme, const fbm_weights *weights, double hurst, int levels,
+                                   int cells, fbm_deviation *out);
+
+#endif
