@@ -122,7 +122,7 @@ static tl_status decode_block(dem_blocks *blocks, const chunk *self, dem_tiff_ha
     const dem_layout *layout = &blocks->layout;
     /* rows of a tile below the raster's last are not asked for: some writers leave them out */
     tmsize_t bytes = (tmsize_t)(self->rows * layout->row_bytes);
-    char *raw = malloc((size_t)bytes);
+    char *raw = calloc(1, (size_t)bytes); /* some decoders call it a success when they fill in a part */
     if (!raw)
         return tl_fail_memory(error, dem_tiff_file_path(blocks->file));
     uint32_t number = block_number(layout, self);
@@ -216,7 +216,7 @@ static tl_status stream_chunk(dem_blocks *blocks, const chunk *self, dem_cached_
     if (status != TL_OK)
         return status;
     float *heights = tl_alloc_grid(layout->width, self->rows, sizeof *heights);
-    char *row = malloc((size_t)layout->row_bytes);
+    char *row = calloc(1, (size_t)layout->row_bytes);
     if (!heights || !row)
         status = tl_fail_memory(error, dem_tiff_file_path(blocks->file));
     else if (sparse)

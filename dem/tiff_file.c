@@ -74,12 +74,18 @@ static toff_t size_of(thandle_t user)
     return (toff_t)((dem_tiff_handle *)user)->file->size;
 }
 
+/* libtiff reports tags that it cannot take as errors, and goes on. */
+static bool is_harmless(const char *format)
+{
+    return strncmp(format, "Defined set_field_type", 22) == 0;
+}
+
 static int catch_error(TIFF *tiff, void *user, const char *module, const char *format, va_list arguments)
 {
     (void)tiff;
     (void)module;
     dem_tiff_handle *handle = user;
-    if (!handle->message[0])
+    if (!handle->message[0] && !is_harmless(format))
         vsnprintf(handle->message, sizeof handle->message, format, arguments);
     return 1; /* handled: the process's own handlers, which print, are not called */
 }
@@ -149,6 +155,7 @@ static tl_status open_handle(const dem_tiff_file *file, dem_tiff_handle **out, t
         free(handle);
         return TL_ERROR_DATA;
     }
+    dem_tiff_forget(handle);
     *out = handle;
     return TL_OK;
 }
