@@ -1,0 +1,40 @@
+#!/bin/sh
+# Installs what is missing, builds talus twice (release; address and undefined sanitizers) and runs every suite in both;
+# checks warnings with clang, the layers, the format and the public header. Ends with "N passed, N failed".
+#   tests/run.sh [FOLDER]    (default: build-tests beside the sources)
+set -eu
+here=$(cd "$(dirname "$0")/.." && pwd)
+. "$here/examples/packages.sh"
+need_packages $build_packages $test_packages
+
+builds=${1:-$here/build-tests}
+mkdir -p "$builds"
+TALUS_SOURCE_ROOT=$here
+export TALUS_SOURCE_ROOT
+failed=0
+
+setup() { # FOLDER OPTION...
+    folder=$1
+    shift
+    [ -f "$folder/build.ninja" ] || meson setup "$folder" "$here" "$@" >"$folder.log" 2>&1 || { cat "$folder.log"; exit 1; }
+}
+
+suite() { # NAME OPTION...: builds and runs all tests; their results are in the build folder
+    name=$1
+    shift
+    setup "$builds/$name" --werror "$@"
+    ninja -C "$builds/$name" --quiet
+    echo "== $name"
+    meson test -C "$builds/$name" --no-rebuild --num-processes 2 --timeout-multiplier 4 --print-errorlogs || failed=1
+}
+
+suite release
+suite sanitize -Db_sanitize=address,undefined -Db_lundef=false -Dbuildtype=debugoptimized
+suite portable -Dsimd=false
+
+echo "== clang"
+CC=clang CXX=clang++ setup "$builds/clang" --werror -Dtests=false
+clang=ok
+ninja -C "$builds/clang" --quiet || clang=failed
+
+python3 "$here/tests/summary.py" "clang warnings=$clang" "$builds"/release "$builds"/sanitize "$builds"/portable
