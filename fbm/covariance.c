@@ -209,13 +209,13 @@ static void add_noise(analysis *a, int level)
 static void summarise(const analysis *a, fbm_deviation *out)
 {
     int n = a->side;
-    double lowest = INFINITY, highest = 0;
+    double lowest = HUGE_VAL, highest = 0;
     *out = (fbm_deviation){.ratio = 1};
     for (int d = 0; d < DIRECTIONS; d++)
         for (int lag = 1; lag <= a->lags; lag++) {
             int dx = lag * directions[d][0], dy = lag * directions[d][1];
             double length = hypot(dx, dy) / (1 << a->levels), theory = pow(length, 2 * a->hurst);
-            double low = INFINITY, high = 0, sum = 0;
+            double low = HUGE_VAL, high = 0, sum = 0;
             const double *v = a->variances + (size_t)(d * a->lags + lag - 1) * (size_t)n * (size_t)n;
             for (int y = most(0, -dy); y < n - most(0, dy); y++)
                 for (int x = 0; x < n - dx; x++) {

@@ -115,7 +115,7 @@ static void seedsNameFields(void **state)
 static void hurstOutOfRangeIsClamped(void **state)
 {
     (void)state;
-    static const double pairs[][2] = {{-1, 0.01}, {NAN, 0.01}, {2, 0.99}};
+    static const double pairs[][2] = {{-1, 0.01}, {(double)NAN, 0.01}, {2, 0.99}};
     for (int k = 0; k < 3; k++) {
         float *a = make_field(9, pairs[k][0], 1, 7), *b = make_field(9, pairs[k][1], 1, 7);
         assert_memory_equal(a, b, 81 * sizeof *a);

@@ -57,7 +57,7 @@ static void splineIsSmooth(void **state)
 {
     (void)state;
     const double step = 1e-3;
-    double before = NAN;
+    double before = (double)NAN;
     for (int k = 150; k <= 940; k++) {
         fbm_weights a, b, c;
         fbm_weights_stationary((k - 1) * step, &a);
@@ -80,7 +80,7 @@ static void hurstIsClamped(void **state)
         scheme->weights(FBM_HURST_MAX, &high);
         scheme->weights(-3, &other);
         assert_memory_equal(&other, &low, sizeof low);
-        scheme->weights(NAN, &other);
+        scheme->weights((double)NAN, &other);
         assert_memory_equal(&other, &low, sizeof low);
         scheme->weights(1.3, &other);
         assert_memory_equal(&other, &high, sizeof high);
