@@ -1,0 +1,281 @@
+/* The check on meshes: every triangle over every sample that it covers, whatever made them. It knows nothing of the
+ * framework, so that neither can hide the other's mistakes. */
+#include "lib/base/error.h"
+#include "lib/base/parallel.h"
+#include "lib/base/size.h"
+
+#include <float.h>
+#include <math.h>
+#include <string.h>
+
+/* Samples of a band: one double and one float each stay in a core's cache. */
+enum { BAND_SAMPLES = 1 << 16, MAX_SIDE = 1 << 30 };
+
+typedef struct band_result {
+    double worst, squares;
+    int64_t i, j;
+    uint64_t samples, uncovered;
+} band_result;
+
+typedef struct verifier {
+    const tl_mesh *mesh;
+    const tl_source *source;
+    int64_t width, height, band_rows;
+    size_t bands;
+    size_t *first;        /* where the triangles of a band begin in `triangles`; bands + 1 */
+    uint32_t *triangles;  /* by band, every triangle in each band that it reaches */
+    float **heights;      /* by worker: the band's samples */
+    double **errors;      /* and the largest error of each, negative where no triangle covers it */
+    band_result *results; /* by band */
+} verifier;
+
+static const tl_vertex *corner(const verifier *self, size_t triangle, int k)
+{
+    return &self->mesh->vertices[self->mesh->indices[3 * triangle + (size_t)k]];
+}
+
+/* ---- One triangle -------------------------------------------------------------------------------- */
+
+/* Twice the signed area of a, b and the sample (x, y). Sides of at most 2^30 keep it below 2^61. */
+static inline int64_t area(const tl_vertex *a, const tl_vertex *b, int64_t x, int64_t y)
+{
+    return (int64_t)(b->i - a->i) * (y - a->j) - (int64_t)(b->j - a->j) * (x - a->i);
+}
+
+static inline int64_t div_down(int64_t a, int64_t b)
+{
+    return a / b - (a % b != 0 && (a < 0) != (b < 0));
+}
+
+/* Narrows low ... high to those x with value + slope (x - from) >= 0. */
+static inline void narrow(int64_t value, int64_t slope, int64_t from, int64_t *low, int64_t *high)
+{
+    if (slope > 0)
+        *low = tl_int64_max(*low, from - div_down(value, slope));
+    else if (slope < 0)
+        *high = tl_int64_min(*high, from + div_down(value, -slope));
+    else if (value < 0)
+        *high = *low - 1;
+}
+
+static inline void note(double *error, double e)
+{
+    if (isnan(e))
+        e = INFINITY;
+    if (e > *error)
+        *error = e;
+}
+
+/* Compares row y of a triangle of positive area; `x0` ... `x1` are its columns, heights and errors those of the row. */
+static void compare_row(const tl_vertex *const v[3], int64_t whole, int64_t y, int64_t x0, int64_t x1, const float *z,
+                        double *errors)
+{
+    int64_t low = x0, high = x1, w[3], step[3];
+    for (int k = 0; k < 3; k++) { /* the weight of vertex k is the area on the opposite side */
+        const tl_vertex *a = v[(k + 1) % 3], *b = v[(k + 2) % 3];
+        w[k] = area(a, b, x0, y);
+        step[k] = (int64_t)a->j - b->j;
+        narrow(w[k], step[k], x0, &low, &high);
+    }
+    for (int64_t x = low; x <= high; x++) {
+        double sum = 0;
+        for (int k = 0; k < 3; k++)
+            sum += (double)(w[k] + step[k] * (x - x0)) * (double)v[k]->z;
+        if (fabsf(z[x]) <= FLT_MAX) /* not a void */
+            note(&errors[x], fabs(sum / (double)whole - (double)z[x]));
+    }
+}
+
+/* Compares the part of a triangle in rows top ... bottom. */
+static void compare_triangle(const verifier *self, size_t triangle, int64_t top, int64_t bottom, const float *heights,
+                             double *errors)
+{
+    const tl_vertex *v[3] = {corner(self, triangle, 0), corner(self, triangle, 1), corner(self, triangle, 2)};
+    int64_t whole = area(v[0], v[1], v[2]->i, v[2]->j);
+    if (whole == 0)
+        return; /* covers nothing */
+    if (whole < 0) {
+        const tl_vertex *swap = v[1];
+        v[1] = v[2];
+        v[2] = swap;
+        whole = -whole;
+    }
+    int64_t x0 = tl_int64_min(tl_int64_min(v[0]->i, v[1]->i), v[2]->i);
+    int64_t x1 = tl_int64_max(tl_int64_max(v[0]->i, v[1]->i), v[2]->i);
+    int64_t y0 = tl_int64_max(tl_int64_min(tl_int64_min(v[0]->j, v[1]->j), v[2]->j), top);
+    int64_t y1 = tl_int64_min(tl_int64_max(tl_int64_max(v[0]->j, v[1]->j), v[2]->j), bottom);
+    for (int64_t y = y0; y <= y1; y++) {
+        int64_t offset = (y - top) * self->width;
+        compare_row(v, whole, y, x0, x1, heights + offset, errors + offset);
+    }
+}
+
+/* ---- One band of rows ------------------------------------------------------------------------------ */
+
+static void sum_up(const verifier *self, int64_t top, int64_t rows, const float *heights, const double *errors,
+                   band_result *out)
+{
+    *out = (band_result){.worst = -1, .i = -1, .j = -1};
+    for (int64_t at = 0; at < rows * self->width; at++) {
+        if (!(fabsf(heights[at]) <= FLT_MAX))
+            continue;
+        if (errors[at] < 0) {
+            out->uncovered++;
+            continue;
+        }
+        out->samples++;
+        out->squares += errors[at] * errors[at];
+        if (errors[at] > out->worst) {
+            out->worst = errors[at];
+            out->i = at % self->width;
+            out->j = top + at / self->width;
+        }
+    }
+}
+
+static tl_status verify_band(void *context, tl_parallel *loop, uint64_t item, unsigned worker, tl_error *error)
+{
+    verifier *self = context;
+    (void)loop;
+    int64_t top = (int64_t)item * self->band_rows, rows = tl_int64_min(self->band_rows, self->height - top);
+    float *heights = self->heights[worker];
+    double *errors = self->errors[worker];
+    tl_window window = {0, top, self->width, rows};
+    tl_status status = tl_source_read(self->source, self->source->info.level, window, heights, error);
+    if (status != TL_OK)
+        return status;
+    for (int64_t at = 0; at < rows * self->width; at++)
+        errors[at] = -1;
+    for (size_t at = self->first[item]; at < self->first[item + 1]; at++)
+        compare_triangle(self, self->triangles[at], top, top + rows - 1, heights, errors);
+    sum_up(self, top, rows, heights, errors, &self->results[item]);
+    return TL_OK;
+}
+
+/* ---- Triangles by bands ---------------------------------------------------------------------------- */
+
+static void bands_of(const verifier *self, size_t triangle, size_t *first, size_t *last)
+{
+    int32_t a = corner(self, triangle, 0)->j, b = corner(self, triangle, 1)->j, c = corner(self, triangle, 2)->j;
+    *first = (size_t)(tl_int64_min(tl_int64_min(a, b), c) / self->band_rows);
+    *last = (size_t)(tl_int64_max(tl_int64_max(a, b), c) / self->band_rows);
+}
+
+/* Counts first, then fills; a triangle keeps its place in the order of the mesh. */
+static tl_status sort_triangles(verifier *self, tl_error *error)
+{
+    size_t first, last, sum = 0;
+    for (size_t t = 0; t < self->mesh->triangle_count; t++) {
+        bands_of(self, t, &first, &last);
+        for (size_t band = first; band <= last; band++)
+            self->first[band]++;
+    }
+    for (size_t band = 0; band <= self->bands; band++) {
+        size_t count = self->first[band];
+        self->first[band] = sum;
+        sum += count;
+    }
+    self->triangles = tl_alloc(sum, sizeof *self->triangles);
+    if (!self->triangles)
+        return tl_fail_memory(error, "the mesh's verification");
+    for (size_t t = 0; t < self->mesh->triangle_count; t++) {
+        bands_of(self, t, &first, &last);
+        for (size_t band = first; band <= last; band++)
+            self->triangles[self->first[band]++] = (uint32_t)t;
+    }
+    memmove(self->first + 1, self->first, self->bands * sizeof *self->first); /* each stands at its end now */
+    self->first[0] = 0;
+    return TL_OK;
+}
+
+/* ---- The whole ------------------------------------------------------------------------------------- */
+
+static tl_status check_mesh(const verifier *self, tl_error *error)
+{
+    const tl_mesh *mesh = self->mesh;
+    const char *name = self->source->info.name;
+    if (self->width > MAX_SIDE || self->height > MAX_SIDE || mesh->triangle_count > UINT32_MAX)
+        return tl_fail(error, TL_ERROR_DATA,
+                       "%s: too large to verify, more than 2^30 samples on a side or 2^32 triangles", name);
+    for (size_t k = 0; k < mesh->vertex_count; k++)
+        if (mesh->vertices[k].i < 0 || mesh->vertices[k].i >= self->width || mesh->vertices[k].j < 0 ||
+            mesh->vertices[k].j >= self->height)
+            return tl_fail(
+                error, TL_ERROR_DATA, "%s: the mesh's vertex %zu lies outside of the %lld x %lld samples; %s", name, k,
+                (long long)self->width, (long long)self->height, "verify it against the grid that it was made from");
+    for (size_t k = 0; k < 3 * mesh->triangle_count; k++)
+        if (mesh->indices[k] >= mesh->vertex_count)
+            return tl_fail(error, TL_ERROR_DATA, "%s: triangle %zu of the mesh names vertex %u, but there are %zu",
+                           name, k / 3, mesh->indices[k], mesh->vertex_count);
+    return TL_OK;
+}
+
+static bool make_scratch(verifier *self, unsigned workers)
+{
+    self->heights = calloc(workers, sizeof *self->heights);
+    self->errors = calloc(workers, sizeof *self->errors);
+    self->first = calloc(self->bands + 1, sizeof *self->first);
+    self->results = calloc(self->bands, sizeof *self->results);
+    for (unsigned i = 0; self->heights && self->errors && i < workers; i++) {
+        self->heights[i] = tl_alloc_grid(self->width, self->band_rows, sizeof **self->heights);
+        self->errors[i] = tl_alloc_grid(self->width, self->band_rows, sizeof **self->errors);
+        if (!self->heights[i] || !self->errors[i])
+            return false;
+    }
+    return self->heights && self->errors && self->first && self->results;
+}
+
+static void free_scratch(verifier *self, unsigned workers)
+{
+    for (unsigned i = 0; i < workers; i++) {
+        if (self->heights)
+            free(self->heights[i]);
+        if (self->errors)
+            free(self->errors[i]);
+    }
+    free(self->heights);
+    free(self->errors);
+    free(self->first);
+    free(self->triangles);
+    free(self->results);
+}
+
+static tl_mesh_report merge(const verifier *self)
+{
+    tl_mesh_report out = {.worst_i = -1, .worst_j = -1};
+    double squares = 0;
+    for (size_t band = 0; band < self->bands; band++) {
+        const band_result *each = &self->results[band];
+        out.samples += each->samples;
+        out.uncovered += each->uncovered;
+        squares += each->squares;
+        if (each->samples && (out.worst_i < 0 || each->worst > out.max_error)) {
+            out.max_error = each->worst;
+            out.worst_i = each->i;
+            out.worst_j = each->j;
+        }
+    }
+    out.rms_error = out.samples ? sqrt(squares / (double)out.samples) : 0;
+    return out;
+}
+
+tl_status tl_mesh_verify(const tl_mesh *mesh, const tl_source *source, const tl_run *run, tl_mesh_report *out,
+                         tl_error *error)
+{
+    verifier self = {.mesh = mesh, .source = source, .width = source->info.width, .height = source->info.height};
+    tl_status status = check_mesh(&self, error);
+    if (status != TL_OK)
+        return status;
+    self.band_rows = tl_int64_min(self.height, tl_int64_max(8, BAND_SAMPLES / self.width));
+    self.bands = (size_t)tl_div_up(self.height, self.band_rows);
+    unsigned workers = tl_parallel_workers(run, self.bands);
+    status =
+        make_scratch(&self, workers) ? sort_triangles(&self, error) : tl_fail_memory(error, "the mesh's verification");
+    if (status == TL_OK)
+        status =
+            tl_parallel_for(run, self.bands, (uint64_t)self.width * (uint64_t)self.height, verify_band, &self, error);
+    if (status == TL_OK)
+        *out = merge(&self);
+    free_scratch(&self, workers);
+    return status;
+}
