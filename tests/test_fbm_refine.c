@@ -273,6 +273,31 @@ static void otherSeedsAndLevelsGiveOtherNoise(void **state)
     }
 }
 
+/* With a filter of one tap and no predictor, the noise shows as it is: that of the new vertex's own cell or edge. */
+static void noiseIsKeyedByLatticeCoordinates(void **state)
+{
+    (void)state;
+    const fbm_window to = {-6, 2, 700, 30, 700};
+    for (const fbm_scheme *scheme = fbm_schemes; scheme->name; scheme++) {
+        fbm_window from = fbm_refine_support(scheme, to);
+        float *in = allocate(samples(from));
+        memset(in, 0, samples(from) * sizeof *in);
+        fbm_step step = {.scheme = scheme, .amplitude = 1, .seed = 31, .level = -2};
+        step.weights.centre_taps[0] = step.weights.edge_taps[0] = 1;
+        float *out = refine(best(), &step, in, from, to);
+        for (int j = 1; j < 16; j++) {
+            float centres[350], rows[350], columns[350];
+            const float *even = out + (2 * j - 2) * 700, *odd = even + 700;
+            fbm_noise_row(31, -2, FBM_NOISE_CENTRES, j, -3, 350, centres);
+            fbm_noise_row(31, -2, FBM_NOISE_ROW_EDGES, j, -3, 350, rows);
+            fbm_noise_row(31, -2, FBM_NOISE_COLUMN_EDGES, j, -3, 350, columns);
+            for (int i = 0; i < 350; i++)
+                assert_true(even[2 * i + 1] == rows[i] && odd[2 * i] == columns[i] && odd[2 * i + 1] == centres[i]);
+        }
+        free(in), free(out);
+    }
+}
+
 /* Variance of the noise on centres and on edges against fbm_weights_residual. The estimate from n values has the
  * standard error sqrt(2 k / n), k = 1 + 2 sum of squared correlations between neighbours < 1.2 for these filters. */
 static void noiseHasTheStatedVariance(void **state)
@@ -368,8 +393,9 @@ int main(void)
         cmocka_unit_test(centresEqualTheOddSamples),         cmocka_unit_test(verticesKeepTheirHeights),
         cmocka_unit_test(gapsBetweenRowsAreLeftAlone),       cmocka_unit_test(smoothRefinementKeepsPlanes),
         cmocka_unit_test(noiseIsProportionalToTheAmplitude), cmocka_unit_test(otherSeedsAndLevelsGiveOtherNoise),
-        cmocka_unit_test(noiseHasTheStatedVariance),         cmocka_unit_test(squareTakesMeansOfCornersAndEnds),
-        cmocka_unit_test(voidsSpreadOverTheStencilOnly),     cmocka_unit_test(supportIsAHaloThatConverges),
+        cmocka_unit_test(noiseIsKeyedByLatticeCoordinates),  cmocka_unit_test(noiseHasTheStatedVariance),
+        cmocka_unit_test(squareTakesMeansOfCornersAndEnds),  cmocka_unit_test(voidsSpreadOverTheStencilOnly),
+        cmocka_unit_test(supportIsAHaloThatConverges),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }

@@ -71,6 +71,21 @@ static void splineIsSmooth(void **state)
     }
 }
 
+/* At the ends the spline is "not a knot": one cubic over the first two intervals, whose fourth differences vanish to 16
+ * roundings of half a unit of 2^-28 (w[3] is 0.07 there). A natural spline is 1e-6 off. */
+static void splineEndsAreNotKnots(void **state)
+{
+    (void)state;
+    static const int binomial[5] = {1, -4, 6, -4, 1};
+    double difference = 0;
+    for (int k = 0; k < 5; k++) {
+        fbm_weights weights;
+        fbm_weights_stationary(0.01 + 0.005 * k, &weights);
+        difference += binomial[k] * (double)weights.w[3];
+    }
+    assert_true(fabs(difference) < 16 * 0x1p-29);
+}
+
 static void hurstIsClamped(void **state)
 {
     (void)state;
@@ -116,6 +131,7 @@ int main(void)
         cmocka_unit_test(predictorSumsToOneAsRounded),
         cmocka_unit_test(splineIsExactAtTheKnots),
         cmocka_unit_test(splineIsSmooth),
+        cmocka_unit_test(splineEndsAreNotKnots),
         cmocka_unit_test(hurstIsClamped),
         cmocka_unit_test(squareHasTheVariancesOfTwoDimensionalKriging),
         cmocka_unit_test(schemesAreFoundByName),
