@@ -72,7 +72,7 @@ static void splineIsSmooth(void **state)
 }
 
 /* At the ends the spline is "not a knot": one cubic over the first two intervals, whose fourth differences vanish to 16
- * roundings of half a unit of 2^-28 (w[3] is 0.07 there). A natural spline is 1e-6 off. */
+ * roundings of half a unit of 2^-28 (w[3] is 0.07 there). The natural spline fails here. */
 static void splineEndsAreNotKnots(void **state)
 {
     (void)state;
