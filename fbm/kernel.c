@@ -36,8 +36,9 @@ static uint64_t row_key(uint64_t seed, int32_t level, fbm_noise_kind kind, int64
  * for every pair: rows would be shifted copies of each other. */
 static void gauss_run(uint32_t a, uint32_t b, uint32_t first, size_t count, float *restrict out)
 {
-    for (size_t k = 0; k < count; k++) {
-        uint32_t h = (first + (uint32_t)k) * a + b;
+    uint32_t x = first * a + b;
+    for (size_t k = 0; k < count; k++, x += a) {
+        uint32_t h = x;
         /* two rounds of xor-shift and multiply, constants of C. Wellons' search (bias 0.17 of 1000) */
         h = (h ^ h >> 16) * 0x7feb352dU;
         h = (h ^ h >> 15) * 0x846ca68bU;

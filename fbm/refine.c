@@ -52,14 +52,21 @@ fbm_window fbm_centres_support(const fbm_scheme *scheme, fbm_window cells)
 
 /* ---- The walk ---------------------------------------------------------------------------------- */
 
-/* Columns of cells that are made at a time: 23 rows of scratch and the rows of the input then stay in a first-level
- * cache of 32 KiB. See tests/bench/bench_refine.c. */
-enum { STRIP = 256, RING = 4, MARGIN = 8, PARTIALS = 5, ROWS = 4 * RING + PARTIALS + 1 };
+/* Most columns of cells that are made at a time, so that 22 rows of scratch stay in a second-level cache. Narrower
+ * strips that would fit into the first level are slower: they write the output in short pieces. */
+enum { STRIP = 2048, RING = 4, MARGIN = 8, PARTIALS = 5, ROWS = 4 * RING + PARTIALS + 1 };
 
 /* Floats of a scratch row for n cells. Odd multiples of a cache line, lest the rows fall into the same few sets. */
 static size_t row_size(size_t n)
 {
     return (n + MARGIN + 15) / 16 * 16 | 16;
+}
+
+/* Cells a strip when `cells` are made in strips of equal width (but for the last). */
+static size_t strip_size(size_t cells)
+{
+    size_t strips = (cells - 1) / STRIP + 1;
+    return (cells - 1) / strips + 1;
 }
 
 size_t fbm_refine_scratch(size_t width)
@@ -111,7 +118,7 @@ static void start(walk *w, const fbm_kernel *kernel, const fbm_step *step, const
         w->centre_taps[k] = step->amplitude * step->weights.centre_taps[k];
         w->edge_taps[k] = step->amplitude * step->weights.edge_taps[k];
     }
-    size_t size = row_size(cells < STRIP ? cells : STRIP);
+    size_t size = row_size(strip_size(cells));
     float **rows[] = {w->centre, w->centre_noise, w->row_noise, w->column_noise};
     for (int k = 0; k < 4; k++)
         for (int r = 0; r < RING; r++, scratch += size)
@@ -324,10 +331,12 @@ void fbm_refine_by(const fbm_kernel *kernel, const fbm_step *step, const float *
         return;
     require(contains(in_window, fbm_refine_support(step->scheme, out_window)) && out_window.stride >= out_window.width);
     int64_t first = half(out_window.i), last = half(out_window.i + (int64_t)out_window.width - 1);
+    size_t cells = (size_t)(last - first + 1), strip = strip_size(cells);
     walk w;
-    start(&w, kernel, step, in, in_window, scratch, (size_t)(last - first + 1));
-    for (w.column = first; w.column <= last; w.column += STRIP) {
-        w.count = last - w.column < STRIP ? (size_t)(last - w.column + 1) : STRIP;
+    start(&w, kernel, step, in, in_window, scratch, cells);
+    for (size_t x = 0; x < cells; x += strip) {
+        w.column = first + (int64_t)x;
+        w.count = cells - x < strip ? cells - x : strip;
         refine_strip(&w, out, out_window);
     }
 }
@@ -340,8 +349,9 @@ void fbm_centres_by(const fbm_kernel *kernel, const fbm_step *step, const float 
     require(contains(in_window, fbm_centres_support(step->scheme, cells)) && cells.stride >= cells.width);
     walk w;
     start(&w, kernel, step, in, in_window, scratch, cells.width);
-    for (size_t x = 0; x < cells.width; x += STRIP) {
-        size_t count = cells.width - x < STRIP ? cells.width - x : STRIP;
+    size_t strip = strip_size(cells.width);
+    for (size_t x = 0; x < cells.width; x += strip) {
+        size_t count = cells.width - x < strip ? cells.width - x : strip;
         int64_t i = cells.i + (int64_t)x;
         bool ring = w.noisy && step->scheme->rule == RULE_STENCIL24;
         for (int64_t j = cells.j - 1; ring && j <= cells.j; j++)

@@ -57,8 +57,8 @@ fbm_window fbm_refine_support(const fbm_scheme *scheme, fbm_window out);
 /* The same for fbm_centres; `cells` as there. */
 fbm_window fbm_centres_support(const fbm_scheme *scheme, fbm_window cells);
 
-/* Floats of scratch that fbm_refine needs for an output of this width; fbm_centres for width / 2. 0 on overflow.
- * It does not depend on the height. */
+/* Floats of scratch that fbm_refine needs for an output of this width, and fbm_centres for half as many cells: at most
+ * 46,000, whatever the height. Never less for a greater width, so one scratch serves every window up to it. */
 size_t fbm_refine_scratch(size_t width);
 
 /* Makes the window `out_window` of level step->level + 1, in coordinates of that level (odd ones are good), from a
