@@ -237,17 +237,12 @@ static bool workspace_bytes(const embedding *e, size_t bytes[6])
     return good;
 }
 
-static double clamp_hurst(double hurst)
-{
-    return hurst > FBM_HURST_MIN ? fmin(hurst, FBM_HURST_MAX) : FBM_HURST_MIN;
-}
-
 size_t fbm_exact_memory(size_t size, double hurst)
 {
     size_t bytes[6], sum = 0;
     if (size < 1 || size > FBM_EXACT_SIZE_MAX)
         return 0;
-    embedding e = plan(size, clamp_hurst(hurst));
+    embedding e = plan(size, fbm_hurst_clamp(hurst));
     if (!workspace_bytes(&e, bytes))
         return 0;
     for (int k = 0; k < 6; k++) {
@@ -285,7 +280,7 @@ fbm_status fbm_exact(size_t size, double hurst, double delta, uint64_t seed, flo
 {
     if (!fbm_exact_memory(size, hurst))
         return FBM_TOO_LARGE;
-    embedding e = plan(size, clamp_hurst(hurst));
+    embedding e = plan(size, fbm_hurst_clamp(hurst));
     workspace ws = {NULL};
     if (!allocate(&e, &ws)) {
         release(&ws);

@@ -40,7 +40,7 @@ static const double table[KNOTS][1 + COLUMNS] = {
 /* Samples in each orbit of the predictor. */
 static const double orbit[4] = {4, 8, 4, 8};
 
-static double clamp_hurst(double hurst)
+double fbm_hurst_clamp(double hurst)
 {
     if (!(hurst > FBM_HURST_MIN))
         return FBM_HURST_MIN;
@@ -129,7 +129,7 @@ static void round_predictor(const double *w, float *out)
 
 void fbm_weights_stationary(double hurst, fbm_weights *out)
 {
-    hurst = clamp_hurst(hurst);
+    hurst = fbm_hurst_clamp(hurst);
     double w[4], turn = pow(2, -hurst / 2);
     for (int k = 0; k < 4; k++)
         w[k] = interpolate(k, hurst);
@@ -143,7 +143,7 @@ void fbm_weights_stationary(double hurst, fbm_weights *out)
 
 void fbm_weights_square(double hurst, fbm_weights *out)
 {
-    hurst = clamp_hurst(hurst);
+    hurst = fbm_hurst_clamp(hurst);
     double grow = pow(2, hurst);
     *out = (fbm_weights){.w = {0.25F}};
     out->centre_taps[0] = (float)sqrt(1 / grow - 0.25 - grow / 8);

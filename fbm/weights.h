@@ -6,6 +6,9 @@
 #define FBM_HURST_MIN 0.01
 #define FBM_HURST_MAX 0.99
 
+/* The nearest exponent in that range; the lower end for NaN. */
+double fbm_hurst_clamp(double hurst);
+
 /* Coefficients in units of the lattice spacing, for amplitude 1.
  *
  * The predictor of a cell's centre, by orbits of the square's symmetry (offsets from the centre in cells):
