@@ -113,8 +113,9 @@ static tl_status read_dem(builder *self, const tl_run *run, tl_error *error)
 
 /* Working memory of one worker. Heights and marks have a frame of one sample around vertices 0 ... block. */
 typedef struct scratch {
-    float *heights, *centres, *across, *down, *rows;
+    float *heights, *centres, *across, *down;
     unsigned char *split;
+    void *rows;
 } scratch;
 
 static int64_t framed(const tl_framework *framework)
@@ -147,7 +148,7 @@ static tl_status make_scratch(builder *self, tl_error *error)
         each->centres = tl_alloc((side / 2 + 3) * (side / 2 + 3), sizeof(float));
         each->across = tl_alloc((side / 4 + 1) * (side / 4 + 1), sizeof(float));
         each->down = tl_alloc((side / 4 + 1) * (side / 4 + 1), sizeof(float));
-        each->rows = tl_alloc(3 * (side / 2 + 2), sizeof(float));
+        each->rows = malloc(tl_patch_scratch((int64_t)side));
         if (!each->heights || !each->split || !each->centres || !each->across || !each->down || !each->rows)
             return tl_fail_memory(error, "the framework");
     }
@@ -235,7 +236,7 @@ static void store_block(const builder *self, const tl_patch *patch, uint64_t blo
     }
 }
 
-static void decide_block(tl_patch *patch, int64_t side, bool voids, float *rows)
+static void decide_block(const tl_patch *patch, int64_t side, bool voids, void *rows)
 {
     tl_patch_decide_samples(patch, voids, rows);
     for (int64_t s = 2; 2 * s <= side; s *= 2) {

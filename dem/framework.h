@@ -76,10 +76,14 @@ static inline int64_t tl_patch_centre_stride(int64_t squares)
     return (squares + 1) / 2 * 2 + 2;
 }
 
-/* Decides all of stage 1 of a patch of samples: its edge points, then its centres. `voids` tells whether NaN may occur;
- * the heights need a frame of one sample then, mirrored at the patch's borders. `rows` is scratch of
- * 3 (width / 2 + 2) floats. */
-void tl_patch_decide_samples(tl_patch *patch, bool voids, float *rows);
+/* Decides all of stage 1 of a patch of samples: its edge points, then its centres. `voids` tells whether NaN may occur.
+ * The heights need a frame of one sample, mirrored at the patch's borders. `scratch` is memory of
+ * tl_patch_scratch(width) bytes, aligned for doubles. */
+void tl_patch_decide_samples(const tl_patch *patch, bool voids, void *scratch);
+static inline size_t tl_patch_scratch(int64_t width)
+{
+    return ((size_t)tl_patch_squares(width, 1) + 4) * (3 * sizeof(double) + 8 * sizeof(float)) + sizeof(double);
+}
 /* Decides row `row` of the edge points of stage s > 1 (0 ... squares of the height), after the centres of s / 2. */
 void tl_patch_decide_edges(const tl_patch *patch, int64_t s, int64_t row);
 /* Makes the frame of `centres` for stage s, after the edge points of that stage. */

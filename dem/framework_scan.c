@@ -292,104 +292,151 @@ void tl_patch_decide_centres(const tl_patch *patch, int64_t s, int64_t row)
     }
 }
 
-/* ---- Stage 1: four samples a triangle, no scans -------------------------------------------------- */
+/* ---- Stage 1: no scans ----------------------------------------------------------------------------
+ *
+ * Half of all vertices, in loops over plain arrays without branches: rows of samples are parted into even and odd
+ * columns first. */
 
-/* The edge point z between z[-step] and z[step], right angles at z[-aside] and z[aside]. */
-static inline float sample_edge(const float *z, int64_t step, int64_t aside, double limit, bool careful, bool voids)
+/* Columns 2 i and 2 i + 1 of a row; odd[-1] and, where the frame has it, odd[columns] may be read. */
+typedef struct parted {
+    float *even, *odd;
+} parted;
+
+typedef struct sampler {
+    const tl_patch *patch;
+    int64_t columns; /* squares */
+    bool careful, voids;
+    parted rows[4];           /* row y at (y + 1) & 3 */
+    double *across[2], *down; /* bounds of the edge points above, below and beside a row of centres */
+} sampler;
+
+static inline parted part_of(const sampler *self, int64_t y)
 {
-    if (voids) {
-        int count = isnan(z[0]) + isnan(z[-step]) + isnan(z[step]) + isnan(z[-aside]) + isnan(z[aside]);
-        if (count)
-            return count == 5 ? NOTHING : NEEDED;
-    }
-    return settled(midpoint_error((double)z[-step], (double)z[0], (double)z[step], careful), limit);
+    return self->rows[(y + 1) & 3];
 }
 
-static inline void sample_across(const tl_patch *patch, int64_t y, float *out, bool careful, bool voids)
+static void part(sampler *self, int64_t y)
 {
-    int64_t columns = tl_patch_squares(patch->width, 1), stride = patch->stride;
-    const float *z = patch->heights + y * stride + 1;
-    unsigned char *split = patch->split + y * patch->split_stride + 1;
-    bool outside = y > patch->rim_y;
-    for (int64_t i = 0; i < columns; i++) {
-        out[i] = outside ? NOTHING : sample_edge(z + 2 * i, 1, stride, patch->max_error, careful, voids);
-        split[2 * i] = out[i] == NEEDED;
+    if (y > self->patch->height + 1)
+        return; /* beyond the frame, for edge points that are outside */
+    const float *z = self->patch->heights + y * self->patch->stride;
+    parted to = part_of(self, y);
+    int64_t pairs = (self->patch->width + 2) / 2;
+    to.odd[-1] = z[-1];
+    for (int64_t i = 0; i < pairs; i++) {
+        to.even[i] = z[2 * i];
+        to.odd[i] = z[2 * i + 1];
     }
-    if (!outside && 2 * columns > patch->rim_x) { /* the last one reaches over the rim */
-        out[columns - 1] = NEEDED;
-        split[2 * columns - 2] = 1;
+    to.even[pairs] = z[2 * pairs];
+}
+
+/* Edge points z between a and b with right angles at c and d. */
+static inline void sample_edges(const sampler *self, const float *restrict a, const float *restrict z,
+                                const float *restrict b, const float *restrict c, const float *restrict d,
+                                double *restrict out, int64_t count)
+{
+    double limit = self->patch->max_error;
+    for (int64_t i = 0; i < count; i++) {
+        double error = midpoint_error((double)a[i], (double)z[i], (double)b[i], self->careful);
+        out[i] = error <= limit ? error : HUGE_VAL;
+    }
+    for (int64_t i = 0; self->voids && i < count; i++) {
+        int known = (a[i] == a[i]) + (b[i] == b[i]) + (z[i] == z[i]) + (c[i] == c[i]) + (d[i] == d[i]);
+        out[i] = known == 5 ? out[i] : known ? HUGE_VAL : -HUGE_VAL;
     }
 }
 
-static inline void sample_down(const tl_patch *patch, int64_t y, float *out, bool careful, bool voids)
+static inline void mark_needed(unsigned char *restrict split, const double *restrict bounds, int64_t count)
 {
-    int64_t columns = tl_patch_squares(patch->width, 1), stride = patch->stride;
-    const float *z = patch->heights + y * stride;
-    unsigned char *split = patch->split + y * patch->split_stride;
-    bool over = y + 1 > patch->rim_y;
-    for (int64_t i = 0; i <= columns && 2 * i <= patch->rim_x; i++) {
-        out[i] = over ? NEEDED : sample_edge(z + 2 * i, stride, 1, patch->max_error, careful, voids);
-        split[2 * i] = out[i] == NEEDED;
+    for (int64_t i = 0; i < count; i++)
+        split[2 * i] = bounds[i] == HUGE_VAL;
+}
+
+static inline void sample_across(const sampler *self, int64_t y, double *out)
+{
+    const tl_patch *patch = self->patch;
+    parted above = part_of(self, y - 1), here = part_of(self, y), below = part_of(self, y + 1);
+    if (y > patch->rim_y) {
+        for (int64_t i = 0; i < self->columns; i++)
+            out[i] = -HUGE_VAL;
+        return;
     }
-    if (2 * columns > patch->rim_x)
-        out[columns] = NOTHING;
+    sample_edges(self, here.even, here.odd, here.even + 1, above.odd, below.odd, out, self->columns);
+    if (2 * self->columns > patch->rim_x)
+        out[self->columns - 1] = HUGE_VAL; /* reaches over the rim */
+    mark_needed(patch->split + y * patch->split_stride + 1, out, self->columns);
+}
+
+static inline void sample_down(const sampler *self, int64_t y, double *out)
+{
+    const tl_patch *patch = self->patch;
+    parted above = part_of(self, y - 1), here = part_of(self, y), below = part_of(self, y + 1);
+    int64_t count = 2 * self->columns > patch->rim_x ? self->columns : self->columns + 1;
+    sample_edges(self, above.even, here.even, below.even, here.odd - 1, here.odd, out, count);
+    for (int64_t i = 0; i < count && y + 1 > patch->rim_y; i++)
+        out[i] = HUGE_VAL;
+    if (count == self->columns)
+        out[count] = -HUGE_VAL; /* outside */
+    mark_needed(patch->split + y * patch->split_stride, out, count);
 }
 
 /* A triangle around a centre of stage 1 covers, beside its corners, the centre and the midpoints of its legs, whose
  * errors are those of the edge points: the largest is its error, exactly. */
-static inline float sample_centre(const float *z, int64_t end, float children, double limit, bool careful, bool voids)
+static inline void sample_centres(const sampler *self, int64_t row, const double *restrict above,
+                                  const double *restrict below, const double *restrict down, float *restrict out)
 {
-    if (voids && children == NOTHING)
-        return NOTHING;
-    double error = midpoint_error((double)z[-end], (double)z[0], (double)z[end], careful);
-    return settled(larger(error, (double)children), limit);
-}
-
-static inline void sample_centres(const tl_patch *patch, int64_t row, const float *above, const float *below,
-                                  const float *left, bool careful, bool voids)
-{
-    int64_t columns = tl_patch_squares(patch->width, 1), y = 2 * row + 1, stride = patch->stride;
-    const float *z = patch->heights + y * stride + 1;
-    unsigned char *split = patch->split + y * patch->split_stride + 1;
-    float *out = patch->centres + (row + 1) * tl_patch_centre_stride(columns) + 1;
-    for (int64_t i = 0; i < columns; i++) {
-        float children = larger4(above[i], below[i], left[i], left[i + 1]);
-        int64_t end = stride + (is_rising(patch, i, row, 1) ? -1 : 1);
-        out[i] = sample_centre(z + 2 * i, end, children, patch->max_error, careful, voids);
-        split[2 * i] = out[i] == NEEDED;
+    const tl_patch *patch = self->patch;
+    parted north = part_of(self, 2 * row), here = part_of(self, 2 * row + 1), south = part_of(self, 2 * row + 2);
+    int64_t rising = is_rising(patch, 0, row, 1);
+    for (int64_t i = 0; i < self->columns; i++) {
+        int64_t turned = (i + rising) & 1;
+        double error = midpoint_error((double)north.even[i + turned], (double)here.odd[i],
+                                      (double)south.even[i + 1 - turned], self->careful);
+        double most = larger(larger(above[i], below[i]), larger(down[i], down[i + 1]));
+        float bound = settled(larger(error, most), patch->max_error);
+        out[i] = self->voids && most == -HUGE_VAL ? NOTHING : bound;
     }
-    if (2 * columns > patch->rim_x) {
-        out[columns - 1] = NEEDED;
-        split[2 * columns - 2] = 1;
-    }
-    for (int64_t i = 0; i < columns && y + 1 > patch->rim_y; i++) {
+    if (2 * self->columns > patch->rim_x)
+        out[self->columns - 1] = NEEDED;
+    for (int64_t i = 0; i < self->columns && 2 * row + 2 > patch->rim_y; i++)
         out[i] = NEEDED;
-        split[2 * i] = 1;
+    unsigned char *split = patch->split + (2 * row + 1) * patch->split_stride + 1;
+    for (int64_t i = 0; i < self->columns; i++)
+        split[2 * i] = out[i] == NEEDED;
+}
+
+static inline __attribute__((always_inline)) void decide_samples(sampler *self, bool careful, bool voids)
+{
+    self->careful = careful; /* constants, for the copy of all this that is made for them */
+    self->voids = voids;
+    int64_t stride = tl_patch_centre_stride(self->columns), rows = tl_patch_squares(self->patch->height, 1);
+    for (int64_t y = -1; y < 2; y++)
+        part(self, y);
+    sample_across(self, 0, self->across[0]);
+    for (int64_t row = 0; row < rows; row++) {
+        double *above = self->across[row & 1], *below = self->across[~row & 1];
+        part(self, 2 * row + 2);
+        part(self, 2 * row + 3);
+        sample_down(self, 2 * row + 1, self->down);
+        sample_across(self, 2 * row + 2, below);
+        sample_centres(self, row, above, below, self->down, self->patch->centres + (row + 1) * stride + 1);
     }
 }
 
-static inline void decide_samples(tl_patch *patch, float *rows, bool careful, bool voids)
+void tl_patch_decide_samples(const tl_patch *patch, bool voids, void *scratch)
 {
-    int64_t pitch = tl_patch_squares(patch->width, 1) + 1, count = tl_patch_squares(patch->height, 1);
-    float *above = rows, *below = rows + pitch, *down = below + pitch;
-    sample_across(patch, 0, above, careful, voids);
-    for (int64_t row = 0; row < count; row++) {
-        sample_down(patch, 2 * row + 1, down, careful, voids);
-        sample_across(patch, 2 * row + 2, below, careful, voids);
-        sample_centres(patch, row, above, below, down, careful, voids);
-        float *swap = above;
-        above = below;
-        below = swap;
-    }
-}
-
-void tl_patch_decide_samples(tl_patch *patch, bool voids, float *rows)
-{
+    sampler self = {.patch = patch, .columns = tl_patch_squares(patch->width, 1)};
+    size_t pitch = (size_t)self.columns + 4;
+    double *bounds = scratch;
+    self.across[0] = bounds, self.across[1] = bounds + pitch, self.down = bounds + 2 * pitch;
+    float *halves = (float *)(bounds + 3 * pitch) + 1;
+    for (int i = 0; i < 4; i++, halves += 2 * pitch)
+        self.rows[i] = (parted){halves, halves + pitch};
     tl_patch_frame_centres(patch, 1);
     if (patch->careful)
-        decide_samples(patch, rows, true, voids);
+        decide_samples(&self, true, voids);
     else if (voids)
-        decide_samples(patch, rows, false, true);
+        decide_samples(&self, false, true);
     else
-        decide_samples(patch, rows, false, false);
+        decide_samples(&self, false, false);
 }

@@ -61,7 +61,7 @@ static inline void narrow(int64_t value, int64_t slope, int64_t from, int64_t *l
 static inline void note(double *error, double e)
 {
     if (isnan(e))
-        e = INFINITY;
+        e = HUGE_VAL;
     if (e > *error)
         *error = e;
 }

@@ -593,8 +593,8 @@ static void frameworkDrawsTwoTrianglesForPlanes(void **state)
         of.z[i] = 0.1f;
     of.z[0] = -0.0f;
     for (int round = 0; round < 2; round++) {
-        tl_framework *framework = build(&of, round ? 0 : 0.1f, 2);
-        tl_mesh *mesh = check_all(&of, framework, round ? 0 : 0.1f);
+        tl_framework *framework = build(&of, round ? 0 : 0.1, 2);
+        tl_mesh *mesh = check_all(&of, framework, round ? 0 : 0.1);
         assert_int_equal(mesh->triangle_count, 2);
         tl_mesh_destroy(mesh);
         tl_framework_destroy(framework);
@@ -664,7 +664,7 @@ static void frameworkRefusesBadBounds(void **state)
     float z[4] = {0};
     grid of = {2, 2, z};
     tl_source *source = open_grid(&of);
-    const double bad[] = {-1, NAN, INFINITY};
+    const double bad[] = {-1, (double)NAN, HUGE_VAL};
     (void)state;
     for (int k = 0; k < 3; k++) {
         tl_error error = {0};
