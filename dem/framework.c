@@ -11,7 +11,7 @@
 
 enum { READ_ROWS = 256 };
 
-/* What one item of a loop found out; merged in order of items. */
+/* What a block found out about its heights. */
 typedef struct findings {
     float magnitude; /* largest |height| */
     bool voids;
@@ -56,19 +56,25 @@ static tl_run phase_run(phase *self)
 
 /* ---- Reading ------------------------------------------------------------------------------------- */
 
-static findings clean(float *z, size_t count)
+/* The magnitude as an integer of the same order, above those of all finite heights for voids. */
+static inline int32_t magnitude_bits(float z)
 {
-    findings found = {0};
-    for (size_t i = 0; i < count; i++) {
-        float size = fabsf(z[i]);
-        if (!(size <= FLT_MAX)) { /* no surface passes an infinite height: a void as well */
+    int32_t bits;
+    memcpy(&bits, &z, sizeof bits);
+    return bits & INT32_MAX;
+}
+
+enum { FINITE_BITS = 0x7f7fffff };
+
+/* No surface passes an infinite height: a void as well. */
+static void clean(float *z, size_t count)
+{
+    int32_t most = 0;
+    for (size_t i = 0; i < count; i++)
+        most = magnitude_bits(z[i]) > most ? magnitude_bits(z[i]) : most;
+    for (size_t i = 0; most > FINITE_BITS && i < count; i++)
+        if (magnitude_bits(z[i]) > FINITE_BITS)
             z[i] = NAN;
-            found.voids = true;
-        } else if (size > found.magnitude) {
-            found.magnitude = size;
-        }
-    }
-    return found;
 }
 
 static tl_status read_band(void *context, tl_parallel *loop, uint64_t item, unsigned worker, tl_error *error)
@@ -81,32 +87,14 @@ static tl_status read_band(void *context, tl_parallel *loop, uint64_t item, unsi
     float *to = self->heights + y * self->width;
     tl_status status = tl_source_read(self->dem, self->framework->info.level, window, to, error);
     if (status == TL_OK)
-        self->found[item] = clean(to, (size_t)(window.width * window.height));
+        clean(to, (size_t)(window.width * window.height));
     return status;
-}
-
-static void merge_findings(builder *self, size_t count)
-{
-    for (size_t i = 0; i < count; i++) {
-        if (self->found[i].magnitude > self->all.magnitude)
-            self->all.magnitude = self->found[i].magnitude;
-        self->all.voids |= self->found[i].voids;
-        self->all.rounds |= self->found[i].rounds;
-    }
 }
 
 static tl_status read_dem(builder *self, const tl_run *run, tl_error *error)
 {
-    size_t bands = (size_t)tl_div_up(self->height, READ_ROWS);
-    self->found = calloc(bands, sizeof *self->found);
-    if (!self->found)
-        return tl_fail_memory(error, "the framework");
-    uint64_t samples = (uint64_t)self->width * (uint64_t)self->height;
-    tl_status status = tl_parallel_for(run, bands, samples, read_band, self, error);
-    merge_findings(self, bands);
-    free(self->found);
-    self->found = NULL;
-    return status;
+    uint64_t bands = (uint64_t)tl_div_up(self->height, READ_ROWS);
+    return tl_parallel_for(run, bands, (uint64_t)self->width * (uint64_t)self->height, read_band, self, error);
 }
 
 /* ---- Blocks -------------------------------------------------------------------------------------- */
@@ -181,37 +169,63 @@ static double rounding_probe(float magnitude, int log)
     return ldexp(1.5, 52 + exponent + 2 * log - 50);
 }
 
+static findings find_magnitude(const tl_patch *patch)
+{
+    int32_t most = 0, voids = 0;
+    for (int64_t y = 0; y <= patch->height; y++) {
+        const float *z = patch->heights + y * patch->stride;
+        for (int64_t x = 0; x <= patch->width; x++) {
+            int32_t bits = magnitude_bits(z[x]), is_void = bits > FINITE_BITS, finite = is_void ? 0 : bits;
+            voids |= is_void;
+            most = finite > most ? finite : most;
+        }
+    }
+    findings found = {.voids = voids};
+    memcpy(&found.magnitude, &most, sizeof most);
+    return found;
+}
+
+/* Whether a height of the patch is no multiple of the step behind a rounding probe. */
+static bool has_finer(const tl_patch *patch, double probe)
+{
+    int64_t finer = 0;
+    for (int64_t y = 0; y <= patch->height; y++) {
+        const float *z = patch->heights + y * patch->stride;
+        for (int64_t x = 0; x <= patch->width; x++)
+            finer |= fabs((double)z[x] + probe - probe - (double)z[x]) > 0; /* false for a void */
+    }
+    return finer;
+}
+
+/* Looks at a block's heights; *own_rounding becomes the rounding error within the block, 0 where there is none. */
 static findings inspect_block(const tl_patch *patch, double *own_rounding, int block_log, int lattice_log)
 {
-    findings found = {0};
-    for (int64_t y = 0; y <= patch->height; y++) {
-        const float *z = patch->heights + y * patch->stride;
-        for (int64_t x = 0; x <= patch->width; x++) {
-            found.magnitude = fabsf(z[x]) > found.magnitude ? fabsf(z[x]) : found.magnitude;
-            found.voids |= isnan(z[x]);
-        }
-    }
-    double block_probe = rounding_probe(found.magnitude, block_log),
-           probe = rounding_probe(found.magnitude, lattice_log);
-    double block_rest = 0, rest = 0;
-    for (int64_t y = 0; y <= patch->height; y++) {
-        const float *z = patch->heights + y * patch->stride;
-        for (int64_t x = 0; x <= patch->width; x++) {
-            double a = fabs((double)z[x] + block_probe - block_probe - (double)z[x]);
-            double b = fabs((double)z[x] + probe - probe - (double)z[x]);
-            block_rest = a > block_rest ? a : block_rest; /* false for a void */
-            rest = b > rest ? b : rest;
-        }
-    }
-    *own_rounding = block_rest > 0 ? tl_plane_rounding((double)found.magnitude) : 0;
-    found.rounds = rest > 0;
+    findings found = find_magnitude(patch);
+    found.rounds = has_finer(patch, rounding_probe(found.magnitude, lattice_log));
+    bool rounds = found.rounds && has_finer(patch, rounding_probe(found.magnitude, block_log));
+    *own_rounding = rounds ? tl_plane_rounding((double)found.magnitude) : 0;
     return found;
+}
+
+/* Eight bytes of 0 or 1 to as many bits, the first the lowest: the factor moves byte k by 56 - 7 k bits, so that all
+ * meet in the highest byte. */
+static inline uint64_t pack8(const unsigned char *bytes)
+{
+    uint64_t eight;
+    memcpy(&eight, bytes, sizeof eight);
+#if __BYTE_ORDER__ == __ORDER_BIG_ENDIAN__
+    eight = __builtin_bswap64(eight);
+#endif
+    return eight * UINT64_C(0x0102040810204080) >> 56;
 }
 
 static uint64_t pack(const unsigned char *bytes, int64_t count)
 {
     uint64_t bits = 0;
-    for (int64_t i = 0; i < count; i++)
+    int64_t i = 0;
+    for (; i + 8 <= count; i += 8)
+        bits |= pack8(bytes + i) << i;
+    for (; i < count; i++)
         bits |= (uint64_t)bytes[i] << i;
     return bits;
 }
@@ -472,7 +486,12 @@ static tl_status decide_blocks(builder *self, const tl_run *run, tl_error *error
     tl_status status = make_scratch(self, error);
     if (status == TL_OK)
         status = tl_parallel_for(run, blocks, (uint64_t)self->width * (uint64_t)self->height, run_block, self, error);
-    merge_findings(self, status == TL_OK ? blocks : 0);
+    for (size_t i = 0; status == TL_OK && i < blocks; i++) {
+        if (self->found[i].magnitude > self->all.magnitude)
+            self->all.magnitude = self->found[i].magnitude;
+        self->all.voids |= self->found[i].voids;
+        self->all.rounds |= self->found[i].rounds;
+    }
     return status;
 }
 
@@ -496,8 +515,8 @@ static tl_status build(builder *self, const tl_run *run, tl_error *error)
         if (framework->lattice_log > TL_BLOCK_LOG)
             status = run_top(self, &run_rest, error);
     }
-    return status == TL_OK ? tl_framework_find_points(framework, self->heights, self->all.voids, &run_rest, error)
-                           : status;
+    framework->voids = self->all.voids || flat;
+    return status == TL_OK ? tl_framework_find_points(framework, self->heights, &run_rest, error) : status;
 }
 
 /* A copy of the DEM's description that outlives it. */

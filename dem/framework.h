@@ -23,6 +23,7 @@ struct tl_framework {
     unsigned threads;
     int lattice_log; /* k */
     int64_t block; /* side of the squares that are decided alone: TL_BLOCK, or the whole lattice where it is smaller */
+    bool voids;    /* the raster may have void samples, or has no cells at all */
     int64_t columns, rows;    /* of blocks */
     size_t words;             /* of 64 samples in a row of the two bitmaps */
     uint64_t *split, *points; /* vertices that split triangles; corners of triangles that are drawn */
@@ -43,8 +44,7 @@ static inline void tl_bit_set(uint64_t *bits, size_t words, int64_t x, int64_t y
 
 /* Fills in `points`, their number, rank and heights, and the number of isolated samples, from `split` and the DEM's
  * heights (width * height, NaN for voids). */
-tl_status tl_framework_find_points(tl_framework *framework, const float *dem, bool voids, const tl_run *run,
-                                   tl_error *error);
+tl_status tl_framework_find_points(tl_framework *framework, const float *dem, const tl_run *run, tl_error *error);
 
 /* A rectangle of the lattice whose triangles are decided together, coarser and coarser. */
 typedef struct tl_patch {

@@ -23,7 +23,6 @@ static const uint32_t NO_POINT = UINT32_MAX;
 typedef struct finder {
     tl_framework *framework;
     const float *dem;
-    bool voids;
     uint64_t *valid;    /* bits of three rows, by worker */
     size_t *counts;     /* points by row */
     uint64_t *isolated; /* by band */
@@ -104,12 +103,12 @@ static tl_status find_band(void *context, tl_parallel *loop, uint64_t item, unsi
     size_t words = self->framework->words;
     int64_t y = (int64_t)item * BAND, end = tl_int64_min(y + BAND, self->framework->info.height);
     uint64_t *above = self->valid + worker * 3 * words, *here = above + words, *below = here + words;
-    if (self->voids) {
+    if (self->framework->voids) {
         valid_row(self, y - 1, above);
         valid_row(self, y, here);
     }
     for (; y < end; y++) {
-        if (!self->voids) {
+        if (!self->framework->voids) {
             find_row(self, NULL, NULL, NULL, y, NULL);
             continue;
         }
@@ -180,12 +179,9 @@ static tl_status find_points(finder *self, const tl_run *run, tl_error *error)
     return tl_parallel_for(run, bands, 0, collect_band, self, error);
 }
 
-tl_status tl_framework_find_points(tl_framework *framework, const float *dem, bool voids, const tl_run *run,
-                                   tl_error *error)
+tl_status tl_framework_find_points(tl_framework *framework, const float *dem, const tl_run *run, tl_error *error)
 {
-    /* one row or column has no triangles at all: the way of voids counts every sample as isolated */
-    finder self = {framework, dem,  voids || framework->info.width == 1 || framework->info.height == 1,
-                   NULL,      NULL, NULL};
+    finder self = {.framework = framework, .dem = dem};
     uint64_t bands = (uint64_t)tl_div_up(framework->info.height, BAND);
     self.valid = tl_alloc(3 * framework->words, tl_parallel_workers(run, bands) * sizeof *self.valid);
     self.counts = tl_alloc((size_t)framework->info.height, sizeof *self.counts);
@@ -364,6 +360,24 @@ static bool exists(const tl_framework *framework, corner apex)
     return tl_bit(framework->split, framework->words, apex.x, apex.y);
 }
 
+/* The triangles of a block that lies inside and has no voids, without drawing them: a split makes one more of each
+ * triangle around its vertex, two of them in the block or, on its border, one. */
+static size_t count_block(const tl_framework *framework, corner origin)
+{
+    square whole = square_at(origin.x, origin.y, framework->block);
+    size_t count = (size_t)exists(framework, whole.first) + exists(framework, whole.second);
+    int64_t side = framework->block;
+    for (int64_t y = 0; y <= side; y++) {
+        const uint64_t *row = framework->split + (size_t)(origin.y + y) * framework->words + (origin.x >> 6);
+        size_t all = 0, first = row[0] & 1, last = row[side >> 6] & 1;
+        for (int64_t w = 0; w < side >> 6; w++)
+            all += (unsigned)__builtin_popcountll(row[w]);
+        bool border = y == 0 || y == side;
+        count += border ? all - first : 2 * (all - first) + first + last; /* the corners split nothing inside */
+    }
+    return count;
+}
+
 static void draw_half(const tl_framework *framework, unpacked *block, sink *to, corner origin, corner a, corner b,
                       corner apex)
 {
@@ -386,6 +400,12 @@ static tl_status draw_item(void *context, tl_parallel *loop, uint64_t item, unsi
     (void)error;
     corner origin = {(int64_t)item % framework->columns * framework->block,
                      (int64_t)item / framework->columns * framework->block};
+    bool inside =
+        origin.x + framework->block < framework->info.width && origin.y + framework->block < framework->info.height;
+    if (!self->indices && inside && !framework->voids && framework->block == TL_BLOCK) {
+        self->counts[item] = count_block(framework, origin);
+        return TL_OK;
+    }
     square whole = square_at(origin.x, origin.y, framework->block);
     sink to = {self->indices ? self->indices + 3 * self->counts[item] : NULL, 0};
     unpacked *block = &self->blocks[worker];

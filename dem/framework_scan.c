@@ -270,10 +270,11 @@ void tl_patch_frame_centres(const tl_patch *patch, int64_t s)
     int64_t columns = tl_patch_squares(patch->width, s), rows = tl_patch_squares(patch->height, s);
     int64_t stride = tl_patch_centre_stride(columns), height = tl_patch_centre_stride(rows);
     for (int64_t y = 0; y < height; y++) {
+        float *row = patch->centres + y * stride;
         bool inside = y > 0 && y <= rows;
-        for (int64_t x = 0; x < stride; x++)
-            if (!inside || x == 0 || x > columns)
-                patch->centres[y * stride + x] = NOTHING;
+        row[0] = NOTHING;
+        for (int64_t x = inside ? columns + 1 : 1; x < stride; x++)
+            row[x] = NOTHING;
     }
 }
 
