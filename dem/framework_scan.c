@@ -298,7 +298,7 @@ void tl_patch_decide_centres(const tl_patch *patch, int64_t s, int64_t row)
  * Half of all vertices, in loops over plain arrays without branches: rows of samples are parted into even and odd
  * columns first. */
 
-/* Columns 2 i and 2 i + 1 of a row; odd[-1] and, where the frame has it, odd[columns] may be read. */
+/* Columns 2 i and 2 i + 1 of a row; odd[-1] and, where the width is even, odd[columns] may be read. */
 typedef struct parted {
     float *even, *odd;
 } parted;
@@ -322,13 +322,15 @@ static void part(sampler *self, int64_t y)
         return; /* beyond the frame, for edge points that are outside */
     const float *z = self->patch->heights + y * self->patch->stride;
     parted to = part_of(self, y);
-    int64_t pairs = (self->patch->width + 2) / 2;
+    int64_t columns = self->columns;
     to.odd[-1] = z[-1];
-    for (int64_t i = 0; i < pairs; i++) {
+    for (int64_t i = 0; i < columns; i++) {
         to.even[i] = z[2 * i];
         to.odd[i] = z[2 * i + 1];
     }
-    to.even[pairs] = z[2 * pairs];
+    to.even[columns] = z[2 * columns];
+    if (2 * columns == self->patch->width)
+        to.odd[columns] = z[2 * columns + 1]; /* in the frame; else beyond it, and beside an edge point outside */
 }
 
 /* Edge points z between a and b with right angles at c and d. */

@@ -515,6 +515,55 @@ static void frameworkForcesParentsInOtherBlocks(void **state)
     }
 }
 
+/* The same where no rim splits the top: a block's centre that only a neighbour's mark forces has parents there. */
+static void frameworkForcesTheTopAboveOtherBlocks(void **state)
+{
+    static const int at[][2] = {{257, 101}, {511, 700}};
+    (void)state;
+    for (size_t k = 0; k < sizeof at / sizeof *at; k++) {
+        grid of = make_grid(1025, 1025, TERRAIN_PLANE, VOIDS_NONE);
+        for (int y = 0; y < 1025; y++)
+            for (int x = 0; x < 1025; x++)
+                of.z[y * 1025 + x] = (float)(2 * x + y);
+        of.z[at[k][1] * 1025 + at[k][0]] += 100;
+        tl_framework *framework = build(&of, 1, 2);
+        tl_mesh *mesh = check_all(&of, framework, 1);
+        check_against_definition(&of, mesh, 1);
+        assert_true(mesh->triangle_count < 400);
+        tl_mesh_destroy(mesh);
+        tl_framework_destroy(framework);
+        free(of.z);
+    }
+}
+
+/* A bound one unit in the last place below the error that a mesh has, as another order of rounding than the
+ * framework's measures it: the next mesh must keep it as measured. */
+static void frameworkKeepsBoundsThatRoundingCouldBreak(void **state)
+{
+    int rebuilt = 0;
+    (void)state;
+    for (int round = 0; round < 400; round++) {
+        random_state = (uint64_t)round + 31;
+        grid of = make_grid(5 + 4 * (round % 2), 5 + 4 * (round % 2), TERRAIN_WIDE, VOIDS_NONE);
+        double max_error = 1e7; /* all heights are below 2^24 / 2 */
+        tl_source *source = open_grid(&of);
+        for (int step = 0; step < 6 && max_error > 0; step++) {
+            tl_framework *framework = build(&of, max_error, 1);
+            tl_mesh *mesh = check_all(&of, framework, max_error);
+            tl_mesh_report report;
+            assert_int_equal(tl_mesh_verify(mesh, source, NULL, &report, NULL), TL_OK);
+            assert_true(report.max_error <= max_error);
+            rebuilt += step && report.max_error > 0;
+            max_error = report.max_error > 0 ? nextafter(report.max_error, 0) : 0;
+            tl_mesh_destroy(mesh);
+            tl_framework_destroy(framework);
+        }
+        tl_source_destroy(source);
+        free(of.z);
+    }
+    assert_true(rebuilt > 400); /* or there was nothing to break */
+}
+
 static void frameworkDoesNotDependOnThreads(void **state)
 {
     (void)state;
@@ -785,6 +834,8 @@ int main(void)
         cmocka_unit_test(frameworkIsTheDefinitionOnRandomDems),
         cmocka_unit_test(frameworkIsTheDefinitionAcrossBlocks),
         cmocka_unit_test(frameworkForcesParentsInOtherBlocks),
+        cmocka_unit_test(frameworkForcesTheTopAboveOtherBlocks),
+        cmocka_unit_test(frameworkKeepsBoundsThatRoundingCouldBreak),
         cmocka_unit_test(frameworkDoesNotDependOnThreads),
         cmocka_unit_test(frameworkNestsWithTheBound),
         cmocka_unit_test(frameworkCountsDegenerateGrids),
