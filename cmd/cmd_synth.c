@@ -95,7 +95,7 @@ static int run_synth(const command *self, int argc, const char **argv, bool help
         {"levels", 'l', OPTION_INTEGER, &set.levels, NULL, "N",
          "halvings of the DEM's spacing, 0...30 (default: 4, 16 times finer)", 0, 30, NULL},
         {"seed", 's', OPTION_INTEGER, &set.seed, NULL, "N", "another seed, another terrain, 0...2^62 (default: 0)", 0,
-         4.6e18, NULL},
+         0x1p62, NULL},
         {"hurst", 0, OPTION_NUMBER, &set.field.hurst, &set.field.hurst_given, "H",
          "Hurst exponent of the detail, 0.01...0.99 (default: measured from the DEM, octave by octave)", 0.01, 0.99,
          NULL},
@@ -159,7 +159,7 @@ static int run_noise(const command *self, int argc, const char **argv, bool help
                                "standard deviation of the height difference over one sample, 0...1e30 (default: 1)", 0,
                                1e30, NULL},
                               {"seed", 's', OPTION_INTEGER, &set.seed, NULL, "N",
-                               "another seed, another surface, 0...2^62 (default: 0)", 0, 4.6e18, NULL},
+                               "another seed, another surface, 0...2^62 (default: 0)", 0, 0x1p62, NULL},
                               {"scheme", 0, OPTION_TEXT, &set.noise.scheme, NULL, "NAME",
                                "way to refine, listed below (default: the first)", 0, 0, NULL},
                               {0}};

@@ -34,6 +34,11 @@ bool command_begin(const command *self, int argc, const char **argv, bool help, 
             complain("an input file is missing");
         result = PARSE_BAD;
     }
+    for (size_t i = 0; result == PARSE_OK && i < rest->count; i++)
+        if (!*rest->names[i]) {
+            complain("the input's name is empty");
+            result = PARSE_BAD;
+        }
     if (result == PARSE_BAD) {
         fprintf(stderr, "Usage: talus %s %s\n'talus help %s' tells more.\n", self->name, self->arguments, self->name);
         arguments_free(rest);
@@ -97,7 +102,7 @@ static void complain_of_ending(const char *path, bool grid, bool mesh)
 
 bool command_output_ok(const common *options, bool grid, bool mesh)
 {
-    if (!options->output) {
+    if (!options->output || !*options->output) {
         complain("no output named; give -o FILE");
         return false;
     }

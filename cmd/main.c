@@ -1,8 +1,10 @@
 #include "cmd/command.h"
 
+#include <fcntl.h>
 #include <locale.h>
 #include <stdio.h>
 #include <string.h>
+#include <unistd.h>
 
 static const command *const commands[] = {&command_info, &command_simplify, &command_synth, &command_preview,
                                           &command_noise};
@@ -43,9 +45,17 @@ static void print_overview(FILE *to)
     fprintf(to, "\nTry: talus synth dem.tif --levels 4 -o terrain.exr\n");
 }
 
+static int too_many(const char *surplus)
+{
+    complain("'%s' is one argument too many", surplus);
+    return EXIT_USAGE;
+}
+
 static int help(int argc, const char **argv)
 {
-    if (argc < 2) {
+    if (argc > 2)
+        return too_many(argv[2]);
+    if (argc < 2 || strcmp(argv[1], "help") == 0 || strcmp(argv[1], "version") == 0) {
         print_overview(stdout);
         return command_done();
     }
@@ -53,23 +63,41 @@ static int help(int argc, const char **argv)
     return named ? named->run(named, 1, argv + 1, true) : unknown(argv[1]);
 }
 
+static int version(int argc, const char **argv)
+{
+    if (argc > 1)
+        return too_many(argv[1]);
+    printf("talus %s\n", tl_version());
+    return command_done();
+}
+
+/* Where the caller closed one of the three standard descriptors, the next file opened would get its number, and
+ * messages would go into an output. What is put there instead refuses to be written, as a closed one does. */
+static void occupy_standard_descriptors(void)
+{
+    int descriptor;
+    do
+        descriptor = open("/dev/null", O_RDONLY);
+    while (descriptor >= 0 && descriptor <= STDERR_FILENO);
+    if (descriptor > STDERR_FILENO)
+        close(descriptor);
+}
+
 int main(int argc, char **words)
 {
     const char **argv = (const char **)words;
+    occupy_standard_descriptors();
+    progress_catch_signals();
     setlocale(LC_CTYPE, ""); /* names of files as they are; numbers stay in the C locale */
     if (argc < 2) {
         print_overview(stderr);
         return EXIT_USAGE;
     }
-    if (strcmp(argv[1], "--version") == 0 || strcmp(argv[1], "version") == 0) {
-        printf("talus %s\n", tl_version());
-        return command_done();
-    }
-    if (strcmp(argv[1], "help") == 0 || strcmp(argv[1], "--help") == 0 || strcmp(argv[1], "-h") == 0)
+    const char *name = argv[1];
+    if (strcmp(name, "--version") == 0 || strcmp(name, "version") == 0)
+        return version(argc - 1, argv + 1);
+    if (strcmp(name, "help") == 0 || strcmp(name, "--help") == 0 || strcmp(name, "-h") == 0)
         return help(argc - 1, argv + 1);
-    const command *chosen = find(argv[1]);
-    if (!chosen)
-        return unknown(argv[1]);
-    progress_catch_signals();
-    return chosen->run(chosen, argc - 1, argv + 1, false);
+    const command *chosen = find(name);
+    return chosen ? chosen->run(chosen, argc - 1, argv + 1, false) : unknown(name);
 }

@@ -87,7 +87,8 @@ static bool integer_value(const option *o, const char *text)
     char *end;
     errno = 0;
     long long value = strtoll(text, &end, 10);
-    if (end == text || *end || errno == ERANGE || (double)value < o->low || (double)value > o->high) {
+    /* compared as integers: above 2^53 a double would round the value, and with it the limit */
+    if (end == text || *end || errno == ERANGE || value < (long long)o->low || value > (long long)o->high) {
         complain("--%s: a whole number from %.0f to %.0f is wanted, not '%s'", o->name, o->low, o->high, text);
         return false;
     }

@@ -23,6 +23,7 @@ void progress_catch_signals(void)
     sigaction(SIGINT, &action, NULL);
     sigaction(SIGTERM, &action, NULL);
     signal(SIGPIPE, SIG_IGN); /* a closed stdout is found when it is flushed, and told as an error */
+    signal(SIGXFSZ, SIG_IGN); /* so is a file above the limit of the shell's ulimit -f */
 }
 
 bool progress_interrupted(void)
