@@ -122,24 +122,17 @@ static tl_status decode_block(dem_blocks *blocks, const chunk *self, dem_tiff_ha
     const dem_layout *layout = &blocks->layout;
     /* rows of a tile below the raster's last are not asked for: some writers leave them out */
     tmsize_t bytes = (tmsize_t)(self->rows * layout->row_bytes);
-    char *raw = calloc(1, (size_t)bytes); /* some decoders call it a success when they fill in a part */
+    char *raw = dem_tiff_scratch(handle, (size_t)bytes);
     if (!raw)
         return tl_fail_memory(error, dem_tiff_file_path(blocks->file));
+    memset(raw, 0, (size_t)bytes); /* some decoders call it a success when they fill in a part */
     uint32_t number = block_number(layout, self);
     tmsize_t got = layout->tiled ? TIFFReadEncodedTile(handle->tiff, number, raw, bytes)
                                  : TIFFReadEncodedStrip(handle->tiff, number, raw, bytes);
     tl_status status = got == bytes ? TL_OK : fail_block(blocks, self, handle, error);
     if (status == TL_OK)
         convert_rows(layout, self, raw, heights);
-    free(raw);
     return status;
-}
-
-static void fill_sparse(const dem_layout *layout, size_t count, float *heights)
-{
-    float height = dem_height_of(&layout->rule, layout->has_nodata ? layout->nodata : 0);
-    for (size_t k = 0; k < count; k++)
-        heights[k] = height;
 }
 
 /* Decides what a block's table entry says before anything is allocated for it. */
@@ -156,21 +149,19 @@ static tl_status look_up_block(const dem_blocks *blocks, const chunk *self, dem_
     return fail_block(blocks, self, handle, error);
 }
 
+/* *heights stays NULL for a sparse block. */
 static tl_status decode_whole(dem_blocks *blocks, const chunk *self, dem_tiff_handle *handle, float **heights,
                               tl_error *error)
 {
     const dem_layout *layout = &blocks->layout;
     bool sparse;
     tl_status status = look_up_block(blocks, self, handle, &sparse, error);
-    if (status != TL_OK)
+    if (status != TL_OK || sparse)
         return status;
     *heights = tl_alloc_grid(layout->block_width, self->rows, sizeof **heights);
     if (!*heights)
         return tl_fail_memory(error, dem_tiff_file_path(blocks->file));
-    if (sparse)
-        fill_sparse(layout, (size_t)(layout->block_width * self->rows), *heights);
-    else
-        status = decode_block(blocks, self, handle, *heights, error);
+    status = decode_block(blocks, self, handle, *heights, error);
     if (status != TL_OK)
         free(*heights);
     return status;
@@ -178,14 +169,14 @@ static tl_status decode_whole(dem_blocks *blocks, const chunk *self, dem_tiff_ha
 
 static tl_status load_whole(dem_blocks *blocks, const chunk *self, dem_cached_block **out, tl_error *error)
 {
-    float *heights;
+    float *heights = NULL;
     dem_tiff_handle *handle;
     tl_status status = dem_tiff_take(blocks->file, &handle, error);
     if (status != TL_OK)
         return status;
     status = decode_whole(blocks, self, handle, &heights, error);
     dem_tiff_give_back(blocks->file, handle);
-    if (status != TL_OK)
+    if (status != TL_OK || !heights)
         return status;
     *out = dem_block_cache_add(blocks->cache, (uint64_t)self->index, heights,
                                (size_t)(blocks->layout.block_width * self->rows));
@@ -201,6 +192,7 @@ static tl_status decode_rows(dem_blocks *blocks, const chunk *self, char *row, f
     dem_tiff_handle *handle = blocks->stream.handle;
     for (int64_t k = 0; k < self->rows; k++) {
         uint16_t plane = layout->separate ? (uint16_t)layout->band : 0;
+        memset(row, 0, (size_t)layout->row_bytes);
         if (TIFFReadScanline(handle->tiff, row, (uint32_t)(self->first + k), plane) != 1)
             return fail_block(blocks, self, handle, error);
         dem_samples_to_heights(layout, row, (size_t)layout->width, heights + k * layout->width);
@@ -211,16 +203,11 @@ static tl_status decode_rows(dem_blocks *blocks, const chunk *self, char *row, f
 static tl_status stream_chunk(dem_blocks *blocks, const chunk *self, dem_cached_block **out, tl_error *error)
 {
     const dem_layout *layout = &blocks->layout;
-    bool sparse;
-    tl_status status = look_up_block(blocks, self, blocks->stream.handle, &sparse, error);
-    if (status != TL_OK)
-        return status;
+    tl_status status = TL_OK;
     float *heights = tl_alloc_grid(layout->width, self->rows, sizeof *heights);
-    char *row = calloc(1, (size_t)layout->row_bytes);
+    char *row = malloc((size_t)layout->row_bytes);
     if (!heights || !row)
         status = tl_fail_memory(error, dem_tiff_file_path(blocks->file));
-    else if (sparse)
-        fill_sparse(layout, (size_t)(layout->width * self->rows), heights);
     else
         status = decode_rows(blocks, self, row, heights, error);
     free(row);
@@ -243,6 +230,10 @@ static tl_status load_streamed(dem_blocks *blocks, const chunk *self, dem_cached
     if (status != TL_OK)
         return status;
     dem_tiff_forget(stream->handle);
+    bool sparse;
+    status = look_up_block(blocks, self, stream->handle, &sparse, error);
+    if (status != TL_OK || sparse)
+        return status;
     int64_t from = stream->next_row > top && stream->next_row <= self->first ? stream->next_row : top;
     for (int64_t y = from;;) {
         chunk at = chunk_at(blocks, 0, y);
@@ -256,6 +247,7 @@ static tl_status load_streamed(dem_blocks *blocks, const chunk *self, dem_cached
 
 /* ---- Reading ---- */
 
+/* The chunk, pinned; NULL where the file leaves its block out. */
 static tl_status get_chunk(dem_blocks *blocks, const chunk *self, dem_cached_block **out, tl_error *error)
 {
     uint64_t key = (uint64_t)self->index;
@@ -273,16 +265,34 @@ static tl_status get_chunk(dem_blocks *blocks, const chunk *self, dem_cached_blo
     return status;
 }
 
-/* Copies what a chunk and the window share. */
+/* Copies what a chunk and the window share; `heights` NULL: a block that is left out, which stands for nodata or 0. */
 static void copy_chunk(const dem_layout *layout, const chunk *self, const float *heights, tl_window window, float *out)
 {
     int64_t left = self->column * layout->block_width;
     int64_t x0 = tl_int64_max(window.x, left), x1 = tl_int64_min(window.x + window.width, left + layout->block_width);
     int64_t y0 = tl_int64_max(window.y, self->first);
     int64_t y1 = tl_int64_min(window.y + window.height, self->first + self->rows);
-    for (int64_t y = y0; y < y1; y++)
-        memcpy(out + (y - window.y) * window.width + (x0 - window.x),
-               heights + (y - self->first) * layout->block_width + (x0 - left), (size_t)(x1 - x0) * sizeof *out);
+    float absent = dem_height_of(&layout->rule, layout->has_nodata ? layout->nodata : 0);
+    for (int64_t y = y0; y < y1; y++) {
+        float *row = out + (y - window.y) * window.width + (x0 - window.x);
+        if (heights)
+            memcpy(row, heights + (y - self->first) * layout->block_width + (x0 - left),
+                   (size_t)(x1 - x0) * sizeof *row);
+        for (int64_t k = 0; !heights && k < x1 - x0; k++)
+            row[k] = absent;
+    }
+}
+
+static tl_status read_chunk(dem_blocks *blocks, const chunk *self, tl_window window, float *out, tl_error *error)
+{
+    dem_cached_block *block;
+    tl_status status = get_chunk(blocks, self, &block, error);
+    if (status != TL_OK)
+        return status;
+    copy_chunk(&blocks->layout, self, block ? dem_cached_block_heights(block) : NULL, window, out);
+    if (block)
+        dem_block_cache_unpin(blocks->cache, block);
+    return TL_OK;
 }
 
 tl_status dem_blocks_read(dem_blocks *blocks, tl_window window, float *out, tl_error *error)
@@ -294,13 +304,10 @@ tl_status dem_blocks_read(dem_blocks *blocks, tl_window window, float *out, tl_e
     for (int64_t y = window.y; y < window.y + window.height;) {
         chunk at = {0};
         for (int64_t column = window.x / layout->block_width; column <= last_column; column++) {
-            dem_cached_block *block;
             at = chunk_at(blocks, column, y);
-            tl_status status = get_chunk(blocks, &at, &block, error);
+            tl_status status = read_chunk(blocks, &at, window, out, error);
             if (status != TL_OK)
                 return status;
-            copy_chunk(layout, &at, dem_cached_block_heights(block), window, out);
-            dem_block_cache_unpin(blocks->cache, block);
         }
         y = at.first + at.rows;
     }

@@ -13,6 +13,7 @@
 
 enum {
     MAX_IDLE = 16,                   /* handles kept for the next reader */
+    MAX_IDLE_SCRATCH = 16 << 20,     /* bytes of scratch that an idle one keeps */
     MIN_ALLOCATION_LIMIT = 64 << 20, /* bytes that libtiff may ask for at once, whatever the file's size */
     MAX_ALLOCATION_LIMIT = 1 << 30,
 };
@@ -163,7 +164,18 @@ static tl_status open_handle(const dem_tiff_file *file, dem_tiff_handle **out, t
 void dem_tiff_drop(dem_tiff_handle *handle)
 {
     TIFFClose(handle->tiff);
+    free(handle->scratch);
     free(handle);
+}
+
+void *dem_tiff_scratch(dem_tiff_handle *handle, size_t bytes)
+{
+    if (bytes <= handle->scratch_bytes)
+        return handle->scratch;
+    free(handle->scratch);
+    handle->scratch = malloc(bytes);
+    handle->scratch_bytes = handle->scratch ? bytes : 0;
+    return handle->scratch;
 }
 
 tl_status dem_tiff_take(dem_tiff_file *file, dem_tiff_handle **out, tl_error *error)
@@ -184,6 +196,11 @@ tl_status dem_tiff_take(dem_tiff_file *file, dem_tiff_handle **out, tl_error *er
 
 void dem_tiff_give_back(dem_tiff_file *file, dem_tiff_handle *handle)
 {
+    if (handle->scratch_bytes > MAX_IDLE_SCRATCH) {
+        free(handle->scratch);
+        handle->scratch = NULL;
+        handle->scratch_bytes = 0;
+    }
     pthread_mutex_lock(&file->lock);
     bool keep = file->idle_count < MAX_IDLE;
     if (keep) {

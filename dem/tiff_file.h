@@ -15,6 +15,8 @@ typedef struct dem_tiff_handle {
     const dem_tiff_file *file;
     uint64_t position;
     char message[200]; /* libtiff's first complaint since dem_tiff_forget */
+    void *scratch;     /* see dem_tiff_scratch */
+    size_t scratch_bytes;
     struct dem_tiff_handle *next;
 } dem_tiff_handle;
 
@@ -32,6 +34,9 @@ void dem_tiff_give_back(dem_tiff_file *file, dem_tiff_handle *handle);
 
 /* Closes a handle instead of giving it back. */
 void dem_tiff_drop(dem_tiff_handle *handle);
+
+/* Memory for the handle's user, of undefined content, until the next call; NULL when out of memory. */
+void *dem_tiff_scratch(dem_tiff_handle *handle, size_t bytes);
 
 void dem_tiff_forget(dem_tiff_handle *handle);
 /* What libtiff said, or `otherwise` where it said nothing. */

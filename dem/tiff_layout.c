@@ -251,7 +251,7 @@ static bool can_be_void(const dem_layout *out)
         return true;
     const dem_value_rule *rule = &out->rule;
     bool has_sign = out->kind == DEM_SAMPLE_INT;
-    double high = ldexp(1, out->bits - has_sign), low = has_sign ? -high : 0; /* high is one too many: no harm */
+    double high = ldexp(1, out->bits - has_sign) - 1, low = has_sign ? -high - 1 : 0;
     if (rule->void_low <= high && rule->void_high >= low)
         return true;
     return fabs(rule->offset) + fabs(rule->scale) * high > (double)FLT_MAX;
