@@ -135,7 +135,7 @@ tl_status tl_output_write_at(tl_output *output, const void *bytes, size_t count,
     return TL_OK;
 }
 
-static tl_status flush(tl_output *output, tl_error *error)
+tl_status tl_output_flush(tl_output *output, tl_error *error)
 {
     tl_status status = tl_output_write_at(output, output->buffer, output->buffered, output->appended, error);
     output->appended += output->buffered;
@@ -148,7 +148,7 @@ tl_status tl_output_append(tl_output *output, const void *bytes, size_t count, t
     const unsigned char *from = bytes;
     while (count) {
         if (output->buffered == BUFFER_BYTES) {
-            tl_status status = flush(output, error);
+            tl_status status = tl_output_flush(output, error);
             if (status != TL_OK)
                 return status;
         }
@@ -198,7 +198,7 @@ static int publish(tl_output *output)
 
 tl_status tl_output_commit(tl_output *output, tl_error *error)
 {
-    tl_status status = flush(output, error);
+    tl_status status = tl_output_flush(output, error);
     /* network file systems tell of a failed write when a descriptor is closed, so one is, while the file has no name */
     int copy = status == TL_OK ? dup(output->descriptor) : -1;
     if (copy >= 0 && close(copy) != 0 && errno != EINTR)

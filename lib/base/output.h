@@ -17,6 +17,8 @@ const char *tl_output_path(const tl_output *output);
 tl_status tl_output_write_at(tl_output *output, const void *bytes, size_t count, uint64_t offset, tl_error *error);
 /* Writes all bytes behind what tl_output_append wrote before (buffered; one thread). */
 tl_status tl_output_append(tl_output *output, const void *bytes, size_t count, tl_error *error);
+/* Writes what tl_output_append holds back, so that only the name is left to tl_output_commit. */
+tl_status tl_output_flush(tl_output *output, tl_error *error);
 /* Makes the file appear, complete, under its name and frees the output, also when it fails: then nothing is left. */
 tl_status tl_output_commit(tl_output *output, tl_error *error);
 /* Drops the file and frees the output. Takes NULL. */

@@ -12,6 +12,7 @@
 #include <libdeflate.h>
 #include <tiffio.h>
 
+#include <errno.h>
 #include <fcntl.h>
 #include <math.h>
 #include <stdio.h>
@@ -30,22 +31,32 @@ enum {
  * little. */
 static const uint64_t classic_limit = UINT64_C(4000000000);
 
+/* The first failure that libtiff told of. Its own words for a full disk are "Write error at scanline 4294967295", so
+ * the system's reason, where there is one, goes before them: errno is set to 0 before each call that writes. */
+typedef struct complaint {
+    bool made;
+    int code; /* errno-value, 0: none */
+    char text[300];
+} complaint;
+
 static int no_message(TIFF *tiff, void *user, const char *module, const char *format, va_list list)
 {
     (void)tiff;
     (void)module;
-    tl_error *error = user;
-    if (error && error->status == TL_OK) {
-        vsnprintf(error->text, sizeof error->text, format, list);
-        error->status = TL_ERROR_IO;
+    complaint *said = user;
+    if (said && !said->made) {
+        said->made = true;
+        said->code = errno;
+        vsnprintf(said->text, sizeof said->text, format, list);
     }
     return 1;
 }
 
-static tl_status tiff_failed(const char *path, const tl_error *said, tl_error *error)
+static tl_status tiff_failed(const char *path, const complaint *said, tl_error *error)
 {
-    return tl_fail(error, TL_ERROR_IO, "%s: cannot write: %.300s", path,
-                   said->status != TL_OK ? said->text : "libtiff refused it");
+    if (said->code)
+        return tl_fail_system(error, path, "write", said->code);
+    return tl_fail(error, TL_ERROR_IO, "%s: cannot write: %s", path, said->made ? said->text : "libtiff refused it");
 }
 
 /* ---- directory ---- */
@@ -231,7 +242,7 @@ typedef struct writing {
     bool compress;
     size_t packed_limit;
     worker *workers;
-    tl_error said; /* by libtiff */
+    complaint said;
 } writing;
 
 static bool worker_init(worker *self, const writing *w)
@@ -270,6 +281,7 @@ static tl_status write_tile(void *context, tl_parallel *loop, uint64_t tile, uns
     }
     if (!tl_parallel_wait_turn(loop, tile))
         return tl_fail(error, TL_ERROR_CANCELLED, "interrupted");
+    errno = 0;
     if (TIFFWriteRawTile(w->tiff, (uint32_t)tile, bytes, (tmsize_t)count) != (tmsize_t)count)
         return tiff_failed(w->path, &w->said, error);
     tl_parallel_end_turn(loop, tile);
@@ -296,12 +308,13 @@ static tl_status write_tiles(writing *w, const tl_run *run, tl_error *error)
 }
 
 /* libtiff on a copy of the descriptor, which it closes; its messages go to `said`. */
-static TIFF *open_tiff(tl_output *output, bool big, tl_error *said)
+static TIFF *open_tiff(tl_output *output, bool big, complaint *said)
 {
     TIFFOpenOptions *options = TIFFOpenOptionsAlloc();
     int descriptor = options ? fcntl(tl_output_descriptor(output), F_DUPFD_CLOEXEC, 0) : -1;
     TIFF *tiff = NULL;
     if (descriptor >= 0) {
+        errno = 0;
         TIFFOpenOptionsSetErrorHandlerExtR(options, no_message, said);
         TIFFOpenOptionsSetWarningHandlerExtR(options, no_message, NULL);
         tiff = TIFFFdOpenExt(descriptor, tl_output_path(output), big ? "w8l" : "wl", options);
@@ -332,13 +345,15 @@ tl_status out_geotiff_write(const tl_source *source, tl_output *output, const tl
     w.tiff = open_tiff(output, (uint64_t)samples * sizeof(float) > classic_limit, &w.said);
     if (!w.tiff)
         return tiff_failed(w.path, &w.said, error);
+    errno = 0;
     tl_status status = set_directory(w.tiff, info, w.compress) ? write_tiles(&w, options->run, error)
                                                                : tiff_failed(w.path, &w.said, error);
     /* TIFFClose cannot fail, so what it would do is done here */
-    if (status == TL_OK && (!TIFFWriteDirectory(w.tiff) || w.said.status != TL_OK))
+    errno = 0;
+    if (status == TL_OK && (!TIFFWriteDirectory(w.tiff) || w.said.made))
         status = tiff_failed(w.path, &w.said, error);
     XTIFFClose(w.tiff);
-    if (status == TL_OK && w.said.status != TL_OK)
+    if (status == TL_OK && w.said.made)
         status = tiff_failed(w.path, &w.said, error);
     return status;
 }

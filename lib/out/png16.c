@@ -10,6 +10,7 @@
 #include <math.h>
 #include <setjmp.h>
 #include <string.h>
+#include <unistd.h>
 
 enum { BAND_SAMPLES = 1 << 21, BAND_ROWS_MAX = 256, BAND_ROWS_MIN = 16, LEVELS = 65535 };
 
@@ -237,6 +238,29 @@ static tl_status write_both(const tl_source *source, tl_output *image, tl_output
     return status == TL_OK ? write_image(source, &code, image, run, error) : status;
 }
 
+/* Commits both, or neither: all bytes are written before the first has its name. The sidecar goes first: a picture
+ * without it cannot be read, so it must not be the one that is there alone. */
+static tl_status commit_both(tl_output *image, tl_output *json, const char *beside, bool overwrite, tl_error *error)
+{
+    tl_status status = tl_output_flush(image, error);
+    if (status == TL_OK)
+        status = tl_output_flush(json, error);
+    if (status != TL_OK) {
+        tl_output_abort(json);
+        tl_output_abort(image);
+        return status;
+    }
+    status = tl_output_commit(json, error);
+    if (status != TL_OK) {
+        tl_output_abort(image);
+        return status;
+    }
+    status = tl_output_commit(image, error);
+    if (status != TL_OK && !overwrite)
+        unlink(beside); /* it is certainly ours: an older one would have been refused */
+    return status;
+}
+
 tl_status out_png16_write(const tl_source *source, const char *path, const tl_write_options *options, tl_error *error)
 {
     const tl_source_info *info = &source->info;
@@ -250,17 +274,12 @@ tl_status out_png16_write(const tl_source *source, const char *path, const tl_wr
     tl_status status = json     ? write_both(source, image, json, options->run, error)
                        : beside ? TL_ERROR_IO
                                 : tl_fail_memory(error, path);
-    /* the sidecar first: a picture without it cannot be read, so it must not be the one that is there alone */
-    if (status == TL_OK) {
-        status = tl_output_commit(json, error);
-        json = NULL;
+    if (status == TL_OK)
+        status = commit_both(image, json, beside, options->overwrite, error);
+    else {
+        tl_output_abort(json);
+        tl_output_abort(image);
     }
-    if (status == TL_OK) {
-        status = tl_output_commit(image, error);
-        image = NULL;
-    }
-    tl_output_abort(json);
-    tl_output_abort(image);
     free(beside);
     return status;
 }
