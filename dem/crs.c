@@ -81,7 +81,7 @@ void dem_projection_to_lonlat(dem_projection *projection, size_t n, double *x, d
     proj_trans_generic(projection->to_lonlat, PJ_FWD, x, sizeof *x, n, y, sizeof *y, n, NULL, 0, 0, NULL, 0, 0);
     for (size_t k = 0; k < n; k++)
         if (!isfinite(x[k]) || !isfinite(y[k]))
-            x[k] = y[k] = NAN;
+            x[k] = y[k] = (double)NAN;
 }
 
 /* ---- Local frames ---- */

@@ -6,18 +6,21 @@
 #include <GeographicLib/UTMUPS.hpp>
 
 #include <cmath>
+#include <limits>
 #include <new>
+
+static const double not_a_number = std::numeric_limits<double>::quiet_NaN();
 
 double dem_geodesic_length(double semi_major, double flattening, double longitude1, double latitude1, double longitude2,
                            double latitude2)
 {
     try {
         const GeographicLib::Geodesic geodesic(semi_major, flattening);
-        double length = NAN;
+        double length = not_a_number;
         geodesic.Inverse(latitude1, longitude1, latitude2, longitude2, length);
         return length;
     } catch (...) {
-        return NAN;
+        return not_a_number;
     }
 }
 
@@ -44,7 +47,7 @@ void dem_tangent_forward(const void *tangent, double longitude, double latitude,
         static_cast<const GeographicLib::LocalCartesian *>(tangent)->Forward(latitude, longitude, height, xyz[0],
                                                                              xyz[1], xyz[2]);
     } catch (...) {
-        xyz[0] = xyz[1] = xyz[2] = NAN;
+        xyz[0] = xyz[1] = xyz[2] = not_a_number;
     }
 }
 

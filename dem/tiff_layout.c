@@ -233,8 +233,8 @@ static void read_nodata(TIFF *tiff, dem_layout *out)
 static void set_void_range(dem_layout *out)
 {
     dem_value_rule *rule = &out->rule;
-    rule->void_low = INFINITY;
-    rule->void_high = -INFINITY;
+    rule->void_low = (double)INFINITY;
+    rule->void_high = (double)-INFINITY;
     if (!out->has_nodata || isnan(out->nodata))
         return;
     double value = out->nodata;

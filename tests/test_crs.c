@@ -245,7 +245,7 @@ static void pointsWithoutAnImageAreNan(void **state)
 {
     (void)state;
     tl_crs *crs = crs_of("EPSG:3035"); /* equal-area: the plane beyond the Earth's disc is empty */
-    double x[3] = {4321000, 1e9, NAN}, y[3] = {3210000, 1e9, 0};
+    double x[3] = {4321000, 1e9, (double)NAN}, y[3] = {3210000, 1e9, 0};
     dem_projection *projection = dem_projection_create(crs, NULL);
     dem_projection_to_lonlat(projection, 3, x, y);
     close_to(x[0], 10, 1e-9);

@@ -17,6 +17,7 @@
 #include <cmocka.h>
 
 static char folder[64], path[96];
+static const double none = (double)NAN, infinite = (double)INFINITY;
 
 static uint32_t random_number(uint32_t *state)
 {
@@ -200,7 +201,7 @@ static double half_bits(unsigned band, uint32_t x, uint32_t y, uint16_t bits, ui
 static void readsHalfFloats(void **state)
 {
     (void)state;
-    const double expected[] = {0, 1, -2, 65504, 0x1p-14, 0x1p-24, -1023 * 0x1p-24, NAN, NAN, NAN};
+    const double expected[] = {0, 1, -2, 65504, 0x1p-14, 0x1p-24, -1023 * 0x1p-24, none, none, none};
     for (int big_endian = 0; big_endian < 2; big_endian++) {
         tl_source *source = make_and_open(&(make_tiff_options){.width = 10,
                                                                .height = 1,
@@ -291,25 +292,25 @@ static void nodataBecomesVoid(void **state)
 {
     (void)state;
     const make_tiff_options int16 = {.bits = 16, .format = SAMPLEFORMAT_INT, .nodata = "-32768"};
-    check_row(&int16, 3, (double[]){-32768, -32767, 0}, (double[]){NAN, -32767, 0});
+    check_row(&int16, 3, (double[]){-32768, -32767, 0}, (double[]){none, -32767, 0});
     const make_tiff_options spaced = {.bits = 16, .format = SAMPLEFORMAT_INT, .nodata = " -9999 "};
-    check_row(&spaced, 2, (double[]){-9999, 9999}, (double[]){NAN, 9999});
+    check_row(&spaced, 2, (double[]){-9999, 9999}, (double[]){none, 9999});
     const make_tiff_options nan = {.nodata = "nan"};
-    check_row(&nan, 3, (double[]){NAN, 0, -0.0}, (double[]){NAN, 0, -0.0});
+    check_row(&nan, 3, (double[]){none, 0, -0.0}, (double[]){none, 0, -0.0});
     /* a float's lowest number, exactly, cut to six digits, and beyond what a float can hold */
     const char *const lowest[] = {"-3.4028234663852886e+38", "-3.40282e+38", "-1.7976931348623157e+308"};
     for (int k = 0; k < 3; k++) {
         const make_tiff_options o = {.nodata = lowest[k]};
         check_row(&o, 2, (double[]){-3.4028234663852886e+38, -1e37},
-                  (double[]){k < 2 ? (double)NAN : -3.4028234663852886e+38, -1e37});
+                  (double[]){k < 2 ? none : -3.4028234663852886e+38, -1e37});
     }
     /* 0.1 is no float: it means the float next to it */
     const make_tiff_options tenth = {.nodata = "0.1"};
-    check_row(&tenth, 2, (double[]){(double)0.1f, 0.2}, (double[]){NAN, 0.2});
+    check_row(&tenth, 2, (double[]){(double)0.1f, 0.2}, (double[]){none, 0.2});
     const make_tiff_options tenth64 = {.bits = 64, .format = SAMPLEFORMAT_IEEEFP, .nodata = "0.1"};
-    check_row(&tenth64, 2, (double[]){0.1, (double)0.1f}, (double[]){NAN, 0.1});
+    check_row(&tenth64, 2, (double[]){0.1, (double)0.1f}, (double[]){none, 0.1});
     const make_tiff_options microsoft = {.nodata = "1.#INF"};
-    check_row(&microsoft, 2, (double[]){1, INFINITY}, (double[]){1, NAN});
+    check_row(&microsoft, 2, (double[]){1, infinite}, (double[]){1, none});
 }
 
 static void nodataOutsideOfTheTypeNeverMatches(void **state)
@@ -330,10 +331,10 @@ static void floatsThatAreNoHeightsAreVoid(void **state)
 {
     (void)state;
     const make_tiff_options single = {.bits = 32, .format = SAMPLEFORMAT_IEEEFP};
-    check_row(&single, 6, (double[]){NAN, INFINITY, -INFINITY, -0.0, 0x1p-149, 3.4028234663852886e+38},
-              (double[]){NAN, NAN, NAN, -0.0, 0x1p-149, 3.4028234663852886e+38});
+    check_row(&single, 6, (double[]){none, infinite, -infinite, -0.0, 0x1p-149, 3.4028234663852886e+38},
+              (double[]){none, none, none, -0.0, 0x1p-149, 3.4028234663852886e+38});
     const make_tiff_options wide = {.bits = 64, .format = SAMPLEFORMAT_IEEEFP};
-    check_row(&wide, 4, (double[]){1e300, -1e300, 1e-300, 0.1}, (double[]){NAN, NAN, 0, 0.1});
+    check_row(&wide, 4, (double[]){1e300, -1e300, 1e-300, 0.1}, (double[]){none, none, 0, 0.1});
 }
 
 static void scaleAndOffsetApplyToTheBand(void **state)
@@ -344,7 +345,7 @@ static void scaleAndOffsetApplyToTheBand(void **state)
                            " <Item name=\"OFFSET\" sample=\"0\" role=\"offset\">-100</Item>\n"
                            " <Item name=\"SCALE\" sample=\"0\" role=\"scale\">0.1</Item>\n</GDALMetadata>\n";
     const make_tiff_options decimetres = {.bits = 16, .format = SAMPLEFORMAT_INT, .nodata = "-1", .metadata = metadata};
-    check_row(&decimetres, 4, (double[]){0, 1, 32767, -1}, (double[]){-100, -100 + 0.1 * 1, -100 + 0.1 * 32767, NAN});
+    check_row(&decimetres, 4, (double[]){0, 1, 32767, -1}, (double[]){-100, -100 + 0.1 * 1, -100 + 0.1 * 32767, none});
     tl_source *source = open_band(0);
     assert_true(source->info.quantum == 0.1);
     tl_source_destroy(source);
@@ -364,7 +365,7 @@ static void scaledHeightsBeyondFloatAreVoid(void **state)
 {
     (void)state;
     const make_tiff_options huge = {.bits = 8, .metadata = "<Item name=\"S\" sample=\"0\" role=\"scale\">1e38</Item>"};
-    check_row(&huge, 3, (double[]){0, 3, 4}, (double[]){0, 3e38, NAN});
+    check_row(&huge, 3, (double[]){0, 3, 4}, (double[]){0, 3e38, none});
 }
 
 static void numbersDoNotDependOnTheLocale(void **state)
@@ -503,7 +504,7 @@ static void matrixAndTiePointsGiveTheTransform(void **state)
 static void positionsThatMakeNoSenseAreNone(void **state)
 {
     (void)state;
-    const double flat[] = {0, 10, 0}, nowhere[] = {0, 0, 0, NAN, 0, 0};
+    const double flat[] = {0, 10, 0}, nowhere[] = {0, 0, 0, none, 0, 0};
     const double line[] = {0, 0, 0, 0, 0, 0, 1, 1, 0, 1, 1, 0, 2, 2, 0, 2, 2, 0};
     check_transform(&(make_tiff_options){.width = 4, .height = 3}, NULL);
     check_transform(&(make_tiff_options){.width = 4, .height = 3, .scale = scale_10}, NULL);
