@@ -3,6 +3,7 @@
 
 #include "lib/base/error.h"
 #include "lib/base/georef.h"
+#include "lib/base/number.h"
 #include "lib/base/parallel.h"
 #include "lib/base/size.h"
 
@@ -457,8 +458,8 @@ static void place_vertices(const tl_framework *framework, tl_vertex *out)
 
 static tl_status describe(const tl_framework *framework, tl_mesh *mesh, tl_error *error)
 {
-    char text[32];
-    snprintf(text, sizeof text, "%.17g", framework->max_error);
+    char text[TL_NUMBER_TEXT];
+    tl_number_text(framework->max_error, text);
     mesh->max_error = framework->max_error;
     tl_status status = tl_mesh_add_parameter(mesh, "max_error", text, error);
     if (status == TL_OK)

@@ -2,6 +2,7 @@
 #include "fbm/estimate.h"
 #include "lib/base/error.h"
 #include "lib/base/georef.h"
+#include "lib/base/number.h"
 #include "lib/base/size.h"
 #include "lib/scene/chain.h"
 #include "lib/scene/roughness.h"
@@ -358,19 +359,16 @@ static void note_all(field *f, const tl_field_options *o, const tl_roughness *me
 {
     const char *name = f->dem->info.name, *slash = strrchr(name, '/');
     size_t used = 0;
+    char number[TL_NUMBER_TEXT];
     note(f, "version", &used, "%s", tl_version());
     note(f, "input", &used, "%.500s", slash ? slash + 1 : name);
     note(f, "levels", &used, "%d", o->levels);
     note(f, "scheme", &used, "%s", f->chain.steps[0].scheme->name);
     note(f, "seed", &used, "%llu", (unsigned long long)o->seed);
-    if (o->hurst_given)
-        note(f, "hurst", &used, "%.17g", o->hurst);
-    else
-        note(f, "hurst", &used, "measured");
-    if (o->delta_given)
-        note(f, "delta", &used, "%.17g", o->delta);
-    else
-        note(f, "delta", &used, "measured");
+    tl_number_text(o->hurst, number);
+    note(f, "hurst", &used, "%s", o->hurst_given ? number : "measured");
+    tl_number_text(o->delta, number);
+    note(f, "delta", &used, "%s", o->delta_given ? number : "measured");
     if (measured->measurable)
         note(f, "measured", &used, "sigma %.6g, exponent %.4g", measured->sigma, measured->hurst);
     else if (!o->delta_given)

@@ -2,6 +2,7 @@
 #include "fbm/exact.h"
 #include "lib/base/error.h"
 #include "lib/base/georef.h"
+#include "lib/base/number.h"
 #include "lib/base/size.h"
 #include "lib/scene/chain.h"
 
@@ -97,9 +98,9 @@ static void note_all(noise *n, const tl_noise_options *o, const fbm_scheme *sche
     note(n, "scheme", scheme->name);
     snprintf(text, sizeof text, "%llu", (unsigned long long)o->seed);
     note(n, "seed", text);
-    snprintf(text, sizeof text, "%.17g", o->hurst);
+    tl_number_text(o->hurst, text);
     note(n, "hurst", text);
-    snprintf(text, sizeof text, "%.17g", o->delta);
+    tl_number_text(o->delta, text);
     note(n, "delta", text);
     n->source.info.parameters = n->parameters;
 }
