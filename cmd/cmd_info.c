@@ -3,6 +3,7 @@
 #include <jansson.h>
 #include <math.h>
 #include <stdio.h>
+#include <stdlib.h>
 #include <string.h>
 
 typedef struct settings {
@@ -41,6 +42,21 @@ static json_t *number(double value)
     return isfinite(value) ? json_real(value) : json_null();
 }
 
+/* JSON is UTF-8, names of files are any bytes: those beyond ASCII become '?' where they are not UTF-8. */
+static json_t *string(const char *text)
+{
+    json_t *value = json_string(text);
+    char *copy = value ? NULL : strdup(text);
+    if (!copy)
+        return value;
+    for (char *c = copy; *c; c++)
+        if ((unsigned char)*c >= 0x80)
+            *c = '?';
+    value = json_string(copy);
+    free(copy);
+    return value;
+}
+
 static json_t *georef_json(const tl_source_info *info)
 {
     const tl_georef *g = &info->georef;
@@ -55,9 +71,9 @@ static json_t *georef_json(const tl_source_info *info)
                   number(g->cell_x), number(g->cell_y), "height_unit_metres", number(g->height_unit));
     json_t *crs = json_null();
     if (g->crs)
-        crs = json_pack("{s:s, s:o, s:b, s:s}", "name", tl_crs_name(g->crs), "epsg",
+        crs = json_pack("{s:o, s:o, s:b, s:o}", "name", string(tl_crs_name(g->crs)), "epsg",
                         tl_crs_epsg(g->crs) ? json_integer(tl_crs_epsg(g->crs)) : json_null(), "geographic",
-                        tl_crs_is_geographic(g->crs), "wkt", tl_crs_wkt(g->crs));
+                        tl_crs_is_geographic(g->crs), "wkt", string(tl_crs_wkt(g->crs)));
     json_object_set_new(object, "crs", crs);
     return object;
 }
@@ -75,14 +91,10 @@ static json_t *file_json(const tl_dem_details *d)
 static void print_json(const facts *f)
 {
     const tl_source_info *info = f->info;
-    json_t *object = json_pack("{s:s, s:I, s:I, s:i, s:s, s:f, s:o}", "name", info->name, "width",
+    json_t *object = json_pack("{s:o, s:I, s:I, s:i, s:s, s:f, s:o}", "name", string(info->name), "width",
                                (json_int_t)info->width, "height", (json_int_t)info->height, "level", info->level,
                                "raster_type", info->type == TL_RASTER_AREA ? "area" : "point", "quantum", info->quantum,
                                "georeference", georef_json(info));
-    if (!object) { /* jansson refuses strings that are not UTF-8 */
-        complain("%s: its name or CRS is not UTF-8, so it cannot be told in JSON", info->name);
-        return;
-    }
     json_object_set_new(object, "file", f->has_details ? file_json(&f->details) : json_null());
     json_object_set_new(object, "heights",
                         json_pack("{s:o, s:o, s:o, s:I, s:I}", "low", number((double)f->range.low), "high",
@@ -94,11 +106,18 @@ static void print_json(const facts *f)
                             : json_null());
     json_t *parameters = json_object();
     for (size_t i = 0; i < info->parameter_count; i++)
-        json_object_set_new(parameters, info->parameters[i].name, json_string(info->parameters[i].value));
+        json_object_set_new(parameters, info->parameters[i].name, string(info->parameters[i].value));
     json_object_set_new(object, "parameters", parameters);
     json_dumpf(object, stdout, JSON_INDENT(2) | JSON_REAL_PRECISION(15));
     putchar('\n');
     json_decref(object);
+}
+
+/* Without the control characters that a name may hold, for they may drive a terminal. */
+static void print_plain(const char *text)
+{
+    for (; *text; text++)
+        putchar((unsigned char)*text < 0x20 || *text == 0x7f ? '?' : *text);
 }
 
 static void print_file(const tl_dem_details *d)
@@ -124,7 +143,8 @@ static void print_place(const tl_source_info *info)
     const tl_georef *g = &info->georef;
     double low[2], high[2];
     extent(info, low, high);
-    printf("CRS          %s", g->crs ? tl_crs_name(g->crs) : "unknown");
+    printf("CRS          ");
+    print_plain(g->crs ? tl_crs_name(g->crs) : "unknown");
     if (g->crs && tl_crs_epsg(g->crs))
         printf(" (EPSG:%d)", tl_crs_epsg(g->crs));
     putchar('\n');
@@ -138,7 +158,8 @@ static void print_place(const tl_source_info *info)
 static void print_text(const facts *f)
 {
     const tl_source_info *info = f->info;
-    printf("%s\nsize         %lld x %lld samples, %s\n", info->name, (long long)info->width, (long long)info->height,
+    print_plain(info->name);
+    printf("\nsize         %lld x %lld samples, %s\n", (long long)info->width, (long long)info->height,
            info->type == TL_RASTER_AREA ? "each the mean of its cell (area)" : "each a point");
     if (f->has_details)
         print_file(&f->details);

@@ -70,14 +70,7 @@ static bool names_scheme(const char *name)
     for (; s->name; s++)
         if (strcmp(s->name, name) == 0)
             return true;
-    size_t count = (size_t)(s - tl_schemes());
-    const char *near = nearest_name(name, &tl_schemes()->name, count, sizeof *s);
-    fprintf(stderr, "talus: --scheme: '%s' is none of", name);
-    for (s = tl_schemes(); s->name; s++)
-        fprintf(stderr, "%s %s", s == tl_schemes() ? "" : ",", s->name);
-    if (near)
-        fprintf(stderr, "; did you mean %s?", near);
-    fputc('\n', stderr);
+    complain_of_choice("scheme", name, &tl_schemes()->name, (size_t)(s - tl_schemes()), sizeof *s);
     return false;
 }
 

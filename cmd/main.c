@@ -20,6 +20,10 @@ static const command *find(const char *name)
 
 static int unknown(const char *name)
 {
+    if (*name == '-') {
+        complain("'%s' stands before the command; options go behind it: talus COMMAND ... %s", name, name);
+        return EXIT_USAGE;
+    }
     const char *names[COMMAND_COUNT + 1];
     for (size_t i = 0; i < COMMAND_COUNT; i++)
         names[i] = commands[i]->name;

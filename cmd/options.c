@@ -46,12 +46,17 @@ static size_t distance(const char *a, const char *b)
     return row[length_b];
 }
 
+static const char *name_at(const void *names, size_t i, size_t stride)
+{
+    return *(const char *const *)((const char *)names + i * stride);
+}
+
 const char *nearest_name(const char *text, const void *names, size_t count, size_t stride)
 {
     const char *best = NULL;
     size_t best_distance = NEAR_DISTANCE + 1;
     for (size_t i = 0; i < count; i++) {
-        const char *name = *(const char *const *)((const char *)names + i * stride);
+        const char *name = name_at(names, i, stride);
         size_t d = distance(text, name);
         if (d < best_distance && d < strlen(name)) {
             best_distance = d;
@@ -59,6 +64,17 @@ const char *nearest_name(const char *text, const void *names, size_t count, size
         }
     }
     return best;
+}
+
+void complain_of_choice(const char *name, const char *text, const void *names, size_t count, size_t stride)
+{
+    fprintf(stderr, "talus: --%s: '%s' is none of", name, text);
+    for (size_t i = 0; i < count; i++)
+        fprintf(stderr, "%s %s", i ? "," : "", name_at(names, i, stride));
+    const char *near = nearest_name(text, names, count, stride);
+    if (near)
+        fprintf(stderr, "; did you mean %s?", near);
+    fputc('\n', stderr);
 }
 
 /* ---- values ---- */
@@ -114,15 +130,13 @@ static bool triple_value(const option *o, const char *text)
 
 static bool choice_value(const option *o, const char *text)
 {
-    for (int i = 0; o->choices[i]; i++)
-        if (strcmp(o->choices[i], text) == 0) {
-            *(int *)o->target = i;
+    int count = 0;
+    for (; o->choices[count]; count++)
+        if (strcmp(o->choices[count], text) == 0) {
+            *(int *)o->target = count;
             return true;
         }
-    fprintf(stderr, "talus: --%s: '%s' is none of", o->name, text);
-    for (int i = 0; o->choices[i]; i++)
-        fprintf(stderr, "%s %s", i ? "," : "", o->choices[i]);
-    fputc('\n', stderr);
+    complain_of_choice(o->name, text, o->choices, (size_t)count, sizeof *o->choices);
     return false;
 }
 

@@ -55,6 +55,10 @@ void options_help(const option_group *groups);
 /* The name nearest to `text` in count names, stride bytes apart (each a const char *); NULL when none is near. */
 const char *nearest_name(const char *text, const void *names, size_t count, size_t stride);
 
+/* Tells on stderr that `text` is none of the names that --NAME takes, and which is nearest; names as in nearest_name.
+ */
+void complain_of_choice(const char *name, const char *text, const void *names, size_t count, size_t stride);
+
 /* "talus: MESSAGE" on stderr. */
 __attribute__((format(printf, 1, 2))) void complain(const char *format, ...);
 

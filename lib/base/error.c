@@ -5,11 +5,29 @@
 #include <stdio.h>
 #include <string.h>
 
-static void make_printable(char *text)
+/* Bytes of the UTF-8 sequence at `c`, 0 where there is none (RFC 3629: no overlong forms, no surrogates). */
+static size_t sequence_length(const unsigned char *c)
 {
-    for (unsigned char *c = (unsigned char *)text; *c; c++)
-        if (*c < 0x20 || *c == 0x7f)
-            *c = '?';
+    size_t length = c[0] < 0x80 ? 1 : c[0] < 0xc2 ? 0 : c[0] < 0xe0 ? 2 : c[0] < 0xf0 ? 3 : c[0] < 0xf5 ? 4 : 0;
+    for (size_t i = 1; i < length; i++)
+        if ((c[i] & 0xc0) != 0x80)
+            return 0;
+    bool overlong = (c[0] == 0xe0 && c[1] < 0xa0) || (c[0] == 0xf0 && c[1] < 0x90);
+    bool beyond = (c[0] == 0xed && c[1] >= 0xa0) || (c[0] == 0xf4 && c[1] >= 0x90);
+    return overlong || beyond ? 0 : length;
+}
+
+void tl_make_printable(char *text)
+{
+    unsigned char *c = (unsigned char *)text;
+    while (*c) {
+        size_t length = sequence_length(c);
+        bool control = *c < 0x20 || *c == 0x7f || (*c == 0xc2 && c[1] < 0xa0);
+        if (length > 0 && !control)
+            c += length;
+        else
+            *c++ = '?';
+    }
 }
 
 tl_status tl_fail(tl_error *error, tl_status status, const char *format, ...)
@@ -19,7 +37,7 @@ tl_status tl_fail(tl_error *error, tl_status status, const char *format, ...)
         va_start(arguments, format);
         vsnprintf(error->text, sizeof error->text, format, arguments);
         va_end(arguments);
-        make_printable(error->text);
+        tl_make_printable(error->text);
         error->status = status;
     }
     return status;

@@ -9,6 +9,9 @@
  * become '?', for a name may hold a newline or a terminal's escape. */
 __attribute__((format(printf, 3, 4))) tl_status tl_fail(tl_error *error, tl_status status, const char *format, ...);
 
+/* Replaces what is no printable ASCII and no UTF-8 by '?', so that the text is one line and can go into a JSON. */
+void tl_make_printable(char *text);
+
 /* Out of memory while making `what`. */
 tl_status tl_fail_memory(tl_error *error, const char *what);
 

@@ -207,8 +207,12 @@ static tl_status read_parameters(exr_source *self, tl_error *error)
     for (int32_t i = 0; i < count; i++) {
         const exr_attribute_t *a;
         if (exr_get_attribute_by_index(self->file, PART, EXR_ATTR_LIST_FILE_ORDER, i, &a) == EXR_ERR_SUCCESS &&
-            a->type == EXR_ATTR_STRING && strncmp(a->name, "talus:", PREFIX) == 0)
+            a->type == EXR_ATTR_STRING && strncmp(a->name, "talus:", PREFIX) == 0) {
+            /* anyone may have written the file; the text lies in memory of the context, which is ours */
+            tl_make_printable((char *)a->name);
+            tl_make_printable((char *)a->string->str);
             self->parameters[kept++] = (tl_parameter){.name = a->name + PREFIX, .value = a->string->str};
+        }
     }
     self->source.info.parameters = self->parameters;
     self->source.info.parameter_count = kept;

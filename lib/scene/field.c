@@ -355,13 +355,22 @@ static void note(field *f, const char *name, size_t *used, const char *format, .
     *used = next < TEXT_LIMIT - 1 ? next : TEXT_LIMIT - 1;
 }
 
-static void note_all(field *f, const tl_field_options *o, const tl_roughness *measured)
+/* The file's name without its folders: any bytes, made fit for a record. */
+static void note_input(field *f, size_t *used)
 {
     const char *name = f->dem->info.name, *slash = strrchr(name, '/');
+    char text[500];
+    snprintf(text, sizeof text, "%s", slash ? slash + 1 : name);
+    tl_make_printable(text);
+    note(f, "input", used, "%s", text);
+}
+
+static void note_all(field *f, const tl_field_options *o, const tl_roughness *measured)
+{
     size_t used = 0;
     char number[TL_NUMBER_TEXT];
     note(f, "version", &used, "%s", tl_version());
-    note(f, "input", &used, "%.500s", slash ? slash + 1 : name);
+    note_input(f, &used);
     note(f, "levels", &used, "%d", o->levels);
     note(f, "scheme", &used, "%s", f->chain.steps[0].scheme->name);
     note(f, "seed", &used, "%llu", (unsigned long long)o->seed);
