@@ -17,10 +17,14 @@ typedef struct settings {
 
 static int report_check(const settings *set, const tl_mesh_report *check)
 {
-    command_say(&set->common,
-                "verified: largest error %.9g at column %lld, row %lld; rms %.4g; %llu samples, %llu uncovered",
-                check->max_error, (long long)check->worst_i, (long long)check->worst_j, check->rms_error,
-                (unsigned long long)check->samples, (unsigned long long)check->uncovered);
+    if (check->samples == 0)
+        command_say(&set->common, "verified: no triangle covers a sample; %llu samples are uncovered",
+                    (unsigned long long)check->uncovered);
+    else
+        command_say(&set->common,
+                    "verified: largest error %.9g at column %lld, row %lld; rms %.4g; %llu samples, %llu uncovered",
+                    check->max_error, (long long)check->worst_i, (long long)check->worst_j, check->rms_error,
+                    (unsigned long long)check->samples, (unsigned long long)check->uncovered);
     if (check->max_error <= set->max_error)
         return EXIT_DONE;
     complain("the mesh is %.9g from the DEM where %.9g was asked for: this is a fault of talus, please report it",

@@ -9,7 +9,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { MAX_OPTIONS = 64, HELP_CODE = MAX_OPTIONS + 1, NEAR_DISTANCE = 3, HELP_COLUMN = 26 };
+enum { MAX_OPTIONS = 64, HELP_CODE = MAX_OPTIONS + 1, HELP_COLUMN = 26 };
 
 void complain(const char *format, ...)
 {
@@ -54,11 +54,12 @@ static const char *name_at(const void *names, size_t i, size_t stride)
 const char *nearest_name(const char *text, const void *names, size_t count, size_t stride)
 {
     const char *best = NULL;
-    size_t best_distance = NEAR_DISTANCE + 1;
+    size_t best_distance = SIZE_MAX;
     for (size_t i = 0; i < count; i++) {
         const char *name = name_at(names, i, stride);
         size_t d = distance(text, name);
-        if (d < best_distance && d < strlen(name)) {
+        /* a third of the letters may be wrong, and two swapped ones in four, but "dots" is not "none" */
+        if (d < best_distance && d <= (strlen(name) + 2) / 3) {
             best_distance = d;
             best = name;
         }
