@@ -3,12 +3,11 @@
 #include "lib/base/parallel.h"
 #include "lib/base/size.h"
 #include "lib/out/out.h"
+#include "lib/out/png_encoder.h"
 
 #include <jansson.h>
-#include <png.h>
 
 #include <math.h>
-#include <setjmp.h>
 #include <string.h>
 #include <unistd.h>
 
@@ -44,81 +43,13 @@ static void encode(const coding *c, const float *heights, size_t count, unsigned
     }
 }
 
-/* ---- libpng, whose errors jump ---- */
-
-typedef struct encoder {
-    png_structp png;
-    png_infop info;
-    tl_output *output;
-    tl_error error; /* the first failure */
-} encoder;
-
-static void on_error(png_structp png, png_const_charp text)
-{
-    encoder *e = png_get_error_ptr(png);
-    if (e->error.status == TL_OK)
-        tl_fail(&e->error, TL_ERROR_IO, "%s: libpng cannot write it: %s", tl_output_path(e->output), text);
-    png_longjmp(png, 1);
-}
-
-static void on_warning(png_structp png, png_const_charp text)
-{
-    (void)png;
-    (void)text;
-}
-
-static void on_write(png_structp png, png_bytep bytes, size_t count)
-{
-    encoder *e = png_get_io_ptr(png);
-    if (tl_output_append(e->output, bytes, count, &e->error) != TL_OK)
-        png_error(png, "cannot write");
-}
-
-static void on_flush(png_structp png)
-{
-    (void)png;
-}
-
-static tl_status encoder_begin(encoder *e, int64_t width, int64_t height)
-{
-    e->png = png_create_write_struct(PNG_LIBPNG_VER_STRING, e, on_error, on_warning);
-    e->info = e->png ? png_create_info_struct(e->png) : NULL;
-    if (!e->info)
-        return tl_fail_memory(&e->error, tl_output_path(e->output));
-    if (setjmp(png_jmpbuf(e->png)))
-        return e->error.status;
-    png_set_user_limits(e->png, PNG_UINT_31_MAX, PNG_UINT_31_MAX);
-    png_set_write_fn(e->png, e, on_write, on_flush);
-    png_set_IHDR(e->png, e->info, (png_uint_32)width, (png_uint_32)height, 16, PNG_COLOR_TYPE_GRAY, PNG_INTERLACE_NONE,
-                 PNG_COMPRESSION_TYPE_DEFAULT, PNG_FILTER_TYPE_DEFAULT);
-    png_write_info(e->png, e->info);
-    return TL_OK;
-}
-
-static tl_status encoder_rows(encoder *e, unsigned char *rows, int64_t width, int64_t count)
-{
-    if (setjmp(png_jmpbuf(e->png)))
-        return e->error.status;
-    for (int64_t row = 0; row < count; row++)
-        png_write_row(e->png, rows + row * width * 2);
-    return TL_OK;
-}
-
-static tl_status encoder_end(encoder *e)
-{
-    if (setjmp(png_jmpbuf(e->png)))
-        return e->error.status;
-    png_write_end(e->png, e->info);
-    return TL_OK;
-}
-
 /* ---- bands ---- */
 
 typedef struct writing {
     const tl_source *source;
     int64_t rows; /* of a band */
     coding code;
-    encoder *encoder;
+    out_png *encoder;
 } writing;
 
 static tl_status write_band(void *context, tl_parallel *loop, uint64_t band, unsigned worker, tl_error *error)
@@ -139,7 +70,7 @@ static tl_status write_band(void *context, tl_parallel *loop, uint64_t band, uns
             status = tl_fail(error, TL_ERROR_CANCELLED, "interrupted");
     }
     if (status == TL_OK) {
-        status = encoder_rows(w->encoder, coded, window.width, window.height);
+        status = out_png_rows(w->encoder, coded, window.height);
         if (status == TL_OK)
             tl_parallel_end_turn(loop, band);
         else
@@ -154,16 +85,16 @@ static tl_status write_image(const tl_source *source, const coding *code, tl_out
                              tl_error *error)
 {
     const tl_source_info *info = &source->info;
-    encoder e = {.output = output};
+    out_png e = {0};
     int64_t rows = tl_int64_max(BAND_ROWS_MIN, tl_int64_min(BAND_ROWS_MAX, BAND_SAMPLES / info->width));
     writing w = {.source = source, .rows = rows, .code = *code, .encoder = &e};
     uint64_t samples = (uint64_t)info->width * (uint64_t)info->height;
-    tl_status status = encoder_begin(&e, info->width, info->height);
+    tl_status status = out_png_begin(&e, output, OUT_PNG_GREY16, info->width, info->height);
     if (status == TL_OK)
         status = tl_parallel_for(run, (uint64_t)tl_div_up(info->height, rows), samples, write_band, &w, &e.error);
     if (status == TL_OK)
-        status = encoder_end(&e);
-    png_destroy_write_struct(&e.png, &e.info);
+        status = out_png_end(&e);
+    out_png_finish(&e);
     if (status != TL_OK && error)
         *error = e.error;
     return status;
