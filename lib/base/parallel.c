@@ -128,17 +128,30 @@ static void report(tl_parallel *loop, uint64_t samples)
     loop->run->progress(loop->run->user, done == loop->items ? samples : share, samples);
 }
 
+static int64_t clock_ns(void)
+{
+    struct timespec now;
+    clock_gettime(CLOCK_MONOTONIC, &now);
+    return now.tv_sec * INT64_C(1000000000) + now.tv_nsec;
+}
+
+/* Reports when the last report, at *last, is long enough ago. */
+static void report_at_times(tl_parallel *loop, uint64_t samples, int64_t *last)
+{
+    int64_t now = clock_ns();
+    if (now - *last < PROGRESS_INTERVAL_NS)
+        return;
+    *last = now;
+    report(loop, samples);
+}
+
 static void wait_for_workers(tl_parallel *loop, uint64_t samples)
 {
+    int64_t last = clock_ns();
     pthread_mutex_lock(&loop->lock);
     while (loop->running) {
-        struct timespec until;
-        clock_gettime(CLOCK_MONOTONIC, &until);
-        until.tv_nsec += PROGRESS_INTERVAL_NS;
-        if (until.tv_nsec >= 1000000000) {
-            until.tv_nsec -= 1000000000;
-            until.tv_sec++;
-        }
+        int64_t end = clock_ns() + PROGRESS_INTERVAL_NS;
+        struct timespec until = {.tv_sec = end / 1000000000, .tv_nsec = end % 1000000000};
         pthread_cond_clockwait(&loop->changed, &loop->lock, CLOCK_MONOTONIC, &until);
         bool raised = cancelled(loop->run);
         pthread_mutex_unlock(&loop->lock);
@@ -147,7 +160,7 @@ static void wait_for_workers(tl_parallel *loop, uint64_t samples)
             tl_run_check(loop->run, &error);
             record_failure(loop, UINT64_MAX, &error);
         }
-        report(loop, samples);
+        report_at_times(loop, samples, &last); /* a turn that ends wakes this thread too */
         pthread_mutex_lock(&loop->lock);
     }
     pthread_mutex_unlock(&loop->lock);
@@ -155,16 +168,9 @@ static void wait_for_workers(tl_parallel *loop, uint64_t samples)
 
 static void run_on_caller(tl_parallel *loop, uint64_t samples)
 {
-    struct timespec last, now;
-    clock_gettime(CLOCK_MONOTONIC, &last);
-    while (step(loop, 0)) {
-        clock_gettime(CLOCK_MONOTONIC, &now);
-        int64_t passed = (now.tv_sec - last.tv_sec) * INT64_C(1000000000) + (now.tv_nsec - last.tv_nsec);
-        if (passed >= PROGRESS_INTERVAL_NS) {
-            report(loop, samples);
-            last = now;
-        }
-    }
+    int64_t last = clock_ns();
+    while (step(loop, 0))
+        report_at_times(loop, samples, &last);
 }
 
 /* Starts up to `count` threads; how many there are. */
