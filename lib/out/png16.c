@@ -157,16 +157,43 @@ static char *sidecar_path(const char *path)
     return result;
 }
 
+/* The heights are read twice, for the numbers depend on their range; the caller sees one run of twice the work. */
+typedef struct two_passes {
+    tl_run run; /* what the passes get */
+    const tl_run *whole;
+    unsigned pass; /* 0 or 1 */
+} two_passes;
+
+static void report_pass(void *user, uint64_t done, uint64_t total)
+{
+    const two_passes *self = user;
+    self->whole->progress(self->whole->user, self->pass * total + done, 2 * total);
+}
+
+static void two_passes_init(two_passes *self, const tl_run *run)
+{
+    *self = (two_passes){.whole = run};
+    if (!run)
+        return;
+    self->run = *run;
+    self->run.user = self;
+    if (run->progress)
+        self->run.progress = report_pass;
+}
+
 static tl_status write_both(const tl_source *source, tl_output *image, tl_output *json, const tl_run *run,
                             tl_error *error)
 {
     tl_range range;
-    tl_status status = tl_source_range(source, run, &range, error); /* a first pass: the numbers depend on the range */
+    two_passes passes;
+    two_passes_init(&passes, run);
+    tl_status status = tl_source_range(source, &passes.run, &range, error);
     if (status != TL_OK)
         return status;
+    passes.pass = 1;
     coding code = coding_of(&range);
     status = write_sidecar(&source->info, &range, &code, json, error);
-    return status == TL_OK ? write_image(source, &code, image, run, error) : status;
+    return status == TL_OK ? write_image(source, &code, image, &passes.run, error) : status;
 }
 
 /* Commits both, or neither: all bytes are written before the first has its name. The sidecar goes first: a picture
