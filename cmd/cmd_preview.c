@@ -8,13 +8,23 @@ typedef struct settings {
     tl_preview_options preview;
     const char *beside;
     int64_t width, height;
-    bool eye_given, target_given;
+    bool eye_given, target_given, azimuth_given, elevation_given;
 } settings;
 
 static bool ends_with_png(const char *path)
 {
     size_t length = strlen(path);
     return length > 4 && (strcmp(path + length - 4, ".png") == 0 || strcmp(path + length - 4, ".PNG") == 0);
+}
+
+/* What is not given is the library's choice for the kind of picture. */
+static void place_sun(settings *set)
+{
+    bool perspective = set->preview.perspective;
+    if (!set->azimuth_given && set->elevation_given)
+        set->preview.sun_azimuth = perspective ? 235 : 315;
+    if (!set->elevation_given && set->azimuth_given)
+        set->preview.sun_elevation = perspective ? 40 : 45;
 }
 
 static bool settings_ok(settings *set)
@@ -36,6 +46,7 @@ static bool settings_ok(settings *set)
     set->preview.width = (int)set->width;
     set->preview.height = (int)set->height;
     set->preview.overwrite = set->common.overwrite;
+    place_sun(set);
     return true;
 }
 
@@ -61,7 +72,7 @@ static int draw(settings *set, const char *input)
 
 static int run(const command *self, int argc, const char **argv, bool help)
 {
-    settings set = {.preview = {.sun_azimuth = 315, .sun_elevation = 45, .exaggeration = 1, .fov = 50}};
+    settings set = {.preview = {.exaggeration = 1, .fov = 50}};
     const option picture[] = {
         {"width", 0, OPTION_INTEGER, &set.width, NULL, "N",
          "pixels, 1...32768 (default: the raster's own, at most 2048; 1920 in perspective)", 1, 32768, NULL},
@@ -71,10 +82,10 @@ static int run(const command *self, int argc, const char **argv, bool help)
          0, 0, NULL},
         {"grey", 0, OPTION_FLAG, &set.preview.grey, NULL, NULL, "shade only, no colours by height", 0, 0, NULL},
         {0}};
-    const option light[] = {{"sun-azimuth", 0, OPTION_NUMBER, &set.preview.sun_azimuth, NULL, "DEG",
-                             "clockwise from north, 0...360 (default: 315)", 0, 360, NULL},
-                            {"sun-elevation", 0, OPTION_NUMBER, &set.preview.sun_elevation, NULL, "DEG",
-                             "above the horizon, 1...90 (default: 45)", 1, 90, NULL},
+    const option light[] = {{"sun-azimuth", 0, OPTION_NUMBER, &set.preview.sun_azimuth, &set.azimuth_given, "DEG",
+                             "clockwise from north, 0...360 (default: 315; 235 in perspective)", 0, 360, NULL},
+                            {"sun-elevation", 0, OPTION_NUMBER, &set.preview.sun_elevation, &set.elevation_given, "DEG",
+                             "above the horizon, 1...90 (default: 45; 40 in perspective)", 1, 90, NULL},
                             {"exaggeration", 0, OPTION_NUMBER, &set.preview.exaggeration, NULL, "X",
                              "factor on heights, 0.01...100 (default: 1)", 0.01, 100, NULL},
                             {0}};

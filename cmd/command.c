@@ -3,7 +3,6 @@
 #include <errno.h>
 #include <stdarg.h>
 #include <stdio.h>
-#include <stdlib.h>
 #include <string.h>
 
 const char *const progress_names[] = {
@@ -24,6 +23,7 @@ bool command_begin(const command *self, int argc, const char **argv, bool help, 
     parse_result result = help ? PARSE_HELP : options_parse(self->name, argc, argv, groups, rest);
     if (result == PARSE_HELP) {
         print_help(self, groups);
+        arguments_free(rest);
         *status = command_done();
         return false;
     }
@@ -46,14 +46,6 @@ bool command_begin(const command *self, int argc, const char **argv, bool help, 
         return false;
     }
     return true;
-}
-
-void arguments_free(arguments *rest)
-{
-    for (size_t i = 0; i < rest->count; i++)
-        free((char *)rest->names[i]);
-    free(rest->names);
-    *rest = (arguments){0};
 }
 
 tl_run command_run(const common *options, progress *bar)

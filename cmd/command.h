@@ -55,7 +55,6 @@ extern const char *const progress_names[];
  * caller ends with *status. */
 bool command_begin(const command *self, int argc, const char **argv, bool help, const option_group *groups, int inputs,
                    arguments *rest, int *status);
-void arguments_free(arguments *rest);
 
 /* The tl_run of a command; reports to *bar. */
 tl_run command_run(const common *options, progress *bar);

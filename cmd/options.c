@@ -195,19 +195,16 @@ static void complain_of_option(poptContext context, int code, const option *cons
         complain("unknown option %s", bad);
 }
 
-static parse_result run_popt(poptContext context, const option *const *flat, size_t count)
+static parse_result run_popt(poptContext context, const option *const *flat, size_t count, arguments *rest)
 {
     int code;
     while ((code = poptGetNextOpt(context)) > 0) {
         if (code == HELP_CODE)
             return PARSE_HELP;
         char *text = poptGetOptArg(context);
-        /* a text option keeps what it points to, for as long as the program runs */
-        const option *o = flat[code - 1];
-        bool good = take_value(o, text);
-        if (o->kind != OPTION_TEXT || !good)
-            free(text);
-        if (!good)
+        if (text)
+            rest->texts[rest->text_count++] = text;
+        if (!take_value(flat[code - 1], text))
             return PARSE_BAD;
     }
     if (code < -1) {
@@ -217,25 +214,31 @@ static parse_result run_popt(poptContext context, const option *const *flat, siz
     return PARSE_OK;
 }
 
-static bool collect_rest(poptContext context, int argc, arguments *rest)
+/* popt frees its own copies of the names with the context. */
+static bool collect_names(poptContext context, arguments *rest)
 {
-    rest->names = malloc((size_t)(argc + 1) * sizeof *rest->names);
-    if (!rest->names)
-        return false;
     const char *name;
-    while ((name = poptGetArg(context)))
-        rest->names[rest->count++] = name;
-    for (size_t i = 0; i < rest->count; i++) /* popt frees its copies with the context */
-        rest->names[i] = strdup(rest->names[i]);
+    while ((name = poptGetArg(context))) {
+        if (!(rest->names[rest->count] = strdup(name)))
+            return false;
+        rest->count++;
+    }
     return true;
 }
 
-parse_result options_parse(const char *command, int argc, const char **argv, const option_group *groups,
-                           arguments *rest)
+void arguments_free(arguments *rest)
 {
-    const option *flat[MAX_OPTIONS];
-    size_t count = flatten(groups, flat);
-    struct poptOption table[MAX_OPTIONS + 2] = {{0}};
+    for (size_t i = 0; i < rest->count; i++)
+        free(rest->names[i]);
+    for (size_t i = 0; i < rest->text_count; i++)
+        free(rest->texts[i]);
+    free(rest->names);
+    free(rest->texts);
+    *rest = (arguments){0};
+}
+
+static void fill_table(struct poptOption *table, const option *const *flat, size_t count)
+{
     for (size_t i = 0; i < count; i++)
         table[i] = (struct poptOption){.longName = flat[i]->name,
                                        .shortName = flat[i]->letter,
@@ -243,18 +246,26 @@ parse_result options_parse(const char *command, int argc, const char **argv, con
                                        .val = (int)i + 1};
     table[count] =
         (struct poptOption){.longName = "help", .shortName = 'h', .argInfo = POPT_ARG_NONE, .val = HELP_CODE};
-    poptContext context = poptGetContext(command, argc, argv, table, 0);
-    if (!context) {
-        complain("not enough memory");
-        return PARSE_BAD;
-    }
-    parse_result result = run_popt(context, flat, count);
-    *rest = (arguments){0};
-    if (result == PARSE_OK && !collect_rest(context, argc, rest)) {
+    table[count + 1] = (struct poptOption){0};
+}
+
+parse_result options_parse(const char *command, int argc, const char **argv, const option_group *groups,
+                           arguments *rest)
+{
+    const option *flat[MAX_OPTIONS];
+    size_t count = flatten(groups, flat);
+    struct poptOption table[MAX_OPTIONS + 2];
+    fill_table(table, flat, count);
+    size_t words = (size_t)argc + 1; /* each word is one name or one text at most */
+    *rest = (arguments){.names = calloc(words, sizeof *rest->names), .texts = calloc(words, sizeof *rest->texts)};
+    poptContext context = rest->names && rest->texts ? poptGetContext(command, argc, argv, table, 0) : NULL;
+    parse_result result = context ? run_popt(context, flat, count, rest) : PARSE_BAD;
+    if (!context || (result == PARSE_OK && !collect_names(context, rest))) {
         complain("not enough memory");
         result = PARSE_BAD;
     }
-    poptFreeContext(context);
+    if (context)
+        poptFreeContext(context);
     return result;
 }
 

@@ -36,18 +36,22 @@ typedef struct option_group {
     const option *options;
 } option_group;
 
-/* What a command line held beside its options. */
+/* What a command line held beside its options, and the texts that its options point to. All is owned. */
 typedef struct arguments {
-    const char **names; /* owned; each points into argv */
+    char **names;
     size_t count;
+    char **texts;
+    size_t text_count;
 } arguments;
 
 typedef enum parse_result { PARSE_OK, PARSE_HELP, PARSE_BAD } parse_result;
 
 /* Parses argv[1 ...] of the command `command`. Mistakes are told on stderr, with the accepted range and the nearest
- * name. */
+ * name. Whatever the result, the caller frees *rest, after the last use of the options. */
 parse_result options_parse(const char *command, int argc, const char **argv, const option_group *groups,
                            arguments *rest);
+
+void arguments_free(arguments *rest);
 
 /* Prints every group's options on stdout. */
 void options_help(const option_group *groups);
