@@ -349,10 +349,11 @@ TL_API tl_status tl_write_mesh(const tl_mesh *mesh, const char *path, const tl_w
 /* ---- Pictures ---------------------------------------------------------------------------------- */
 
 typedef struct tl_preview_options {
-    int width, height; /* pixels; 0: the source's own shape, at most 2048 on the longer side (hillshade), 1920 x 1080
-                          (perspective) */
-    double sun_azimuth, sun_elevation; /* degrees, clockwise from north and above the horizon; both 0: 315 and 45 */
-    double exaggeration;               /* factor on heights; 0: 1 */
+    int width, height; /* pixels, at most 32768; 0: the source's own shape, at most 2048 on the longer side (hillshade),
+                          1920 x 1080 (perspective) */
+    double sun_azimuth, sun_elevation; /* degrees, clockwise from north and above the horizon (0 ... 90); both 0: 315
+                                          and 45 (hillshade), 235 and 40 (perspective) */
+    double exaggeration;               /* factor on heights (and on the eye's and the target's), 0 ... 1e6; 0: 1 */
     bool grey;                         /* no hypsometric colours */
     bool perspective;                  /* look from `eye` to `target` instead of straight down */
     /* CRS coordinates (or columns and negative rows where there is no CRS) and height above the datum in metres. */
@@ -363,8 +364,13 @@ typedef struct tl_preview_options {
     const tl_run *run;
 } tl_preview_options;
 
-/* Draws a source as a PNG: hillshade from above, or a perspective. Voids are transparent. `beside` may name a
- * second source, drawn to the right of the first with the same colours and the same footprint; hillshade only. */
+/* Draws a source as a PNG: hillshade from above, with north at the top and as many metres a pixel both ways, or a
+ * perspective, by default as a model with walls around it. Voids are transparent (in a perspective one sees through
+ * them). If both width and height are asked for, what the raster does not fill is transparent too.
+ * `beside` may name a second source, drawn to the right of the first with the same colours on the same ground (by
+ * coordinates if both have the same CRS, else both cover the same); hillshade only. The finer of the two is then shown
+ * with a sample a pixel, as much of the middle as fits into width x height (of both together; by default at most
+ * 2048 x 1020), so that one sees what it has more than the other. */
 TL_API tl_status tl_write_preview(const tl_source *source, const tl_source *beside, const char *path,
                                   const tl_preview_options *options, tl_error *error);
 

@@ -231,7 +231,8 @@ static tl_status shade(const tl_source *const *sources, const scene_raster *rast
     scene_light light;
     if (!palette)
         return tl_fail_memory(error, "the picture");
-    scene_light_init(&light, options->sun_azimuth, options->sun_elevation);
+    bool given = options->sun_azimuth != 0 || options->sun_elevation != 0;
+    scene_light_init(&light, given ? options->sun_azimuth : 315, given ? options->sun_elevation : 45);
     scene_encode_prepare();
     const tl_georef *georef = &sources[0]->info.georef;
     tl_run run = quiet(options->run); /* the work was in the reading */

@@ -12,8 +12,9 @@ typedef struct stop {
 } stop;
 
 /* Greens of valleys, dry yellows, rock, and pale summits: muted, so that the light carries the shape. */
-static const stop land[] = {{0.00f, 0x7f9f80}, {0.14f, 0x97ae84}, {0.30f, 0xbcc296}, {0.46f, 0xdbcfa3},
-                            {0.60f, 0xd0b38a}, {0.74f, 0xb8977a}, {0.88f, 0xc2b3a6}, {1.00f, 0xf4f1ec}};
+static const stop land[] = {{0.00f, 0x85a089}, {0.14f, 0x9ab08b}, {0.30f, 0xbac19b},
+                            {0.46f, 0xd6cdab}, {0.60f, 0xcab496}, {0.74f, 0xb59d86},
+                            {0.87f, 0xbbb0a6}, {0.95f, 0xd7d1ca}, {1.00f, 0xf2f0ec}};
 static const stop sea[] = {{0.00f, 0x1f3f6e}, {0.35f, 0x35669a}, {0.70f, 0x659bc0}, {1.00f, 0xb4d6dd}};
 static const stop plain[] = {{0, 0xd9d8d5}, {1, 0xd9d8d5}};
 
@@ -112,10 +113,6 @@ static void direction(float out[3], double azimuth, double elevation)
 
 void scene_light_init(scene_light *light, double azimuth, double elevation)
 {
-    if (azimuth == 0 && elevation == 0) {
-        azimuth = 315;
-        elevation = 45;
-    }
     direction(light->sun, azimuth, elevation);
     direction(light->fill, azimuth - 80, 30);
 }

@@ -29,7 +29,7 @@ typedef struct scene_light {
     float sun[3], fill[3]; /* unit vectors, east, north, up */
 } scene_light;
 
-/* Degrees; both 0: 315 and 45. */
+/* Degrees. */
 void scene_light_init(scene_light *light, double azimuth, double elevation);
 /* The light that a surface sends to the eye: `east` and `north` are its slopes (metres up a metre), `shadow` is 0 where
  * the sun is hidden, 1 where it shines. */

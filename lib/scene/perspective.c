@@ -38,7 +38,7 @@ typedef struct scene {
     double low, high; /* of all ground, exaggerated metres */
     bool walls;       /* sides down to `foot`, as of a model */
     double foot;
-    double near_plane, haze; /* metres; at the latter half of the light is lost */
+    double near_plane, haze; /* metres; at the latter half of the light is lost; 0: clear air */
     tile *tiles;             /* front to back */
     size_t tile_count, tile_room;
     scene_picture *picture;
@@ -69,6 +69,10 @@ static bool tile_box(const scene *s, scene_tile_id id, scene_box *box)
                         (double)bounds.low * s->ground.metres},
                        {((double)x1 - middle_x) * s->ground.cell_x, (middle_y - (double)y0) * s->ground.cell_y,
                         (double)bounds.high * s->ground.metres}};
+    /* vertices of coarse steps are means that reach over the tile's rim */
+    double reach = ldexp(fmax(s->ground.cell_x, s->ground.cell_y), id.step);
+    box->low[2] = fmax(box->low[2] - reach, s->low);
+    box->high[2] = fmin(box->high[2] + reach, s->high);
     if (s->walls && (x0 == 0 || y0 == 0 || x1 == info->width - 1 || y1 == info->height - 1))
         box->low[2] = s->foot;
     return bounds.low <= bounds.high;
@@ -291,84 +295,133 @@ static void place_corners(const scene *s, easel *e, int columns, int rows)
         }
 }
 
+/* The corner of a cell that alone is missing; 4: none is, -1: more are, so that nothing is drawn there. */
+static int missing_corner(const easel *e, int k)
+{
+    const int at[4] = {k, k + 1, k + SCENE_GRID + 1, k + SCENE_GRID};
+    int missing = 4;
+    for (int n = 0; n < 4; n++)
+        if (isnan(e->heights[at[n]])) {
+            if (missing != 4)
+                return -1;
+            missing = n;
+        }
+    return missing;
+}
+
 /* One cell; with a corner missing the triangle of the others. The diagonal joins the corners that differ less, so that
  * ridges and valleys are not cut into teeth. */
 static void draw_cell(easel *e, int k)
 {
     const int at[4] = {k, k + 1, k + SCENE_GRID + 1, k + SCENE_GRID};
-    const scene_corner *c[4];
-    float z[4];
-    int there = 0, missing = -1;
-    for (int n = 0; n < 4; n++) {
-        c[n] = &e->corners[at[n]];
-        z[n] = e->heights[at[n]];
-        there += !isnan(z[n]);
-        missing = isnan(z[n]) ? n : missing;
+    int missing = missing_corner(e, k), first = (missing + 1) & 3;
+    if (missing < 0)
+        return;
+    if (missing == 4) {
+        float falling = fabsf(e->heights[at[0]] - e->heights[at[2]]),
+              rising = fabsf(e->heights[at[1]] - e->heights[at[3]]);
+        first = rising < falling;
+        scene_zbuffer_triangle(&e->buffer, &e->corners[at[first]], &e->corners[at[first + 2]],
+                               &e->corners[at[(first + 3) & 3]]);
     }
-    if (there == 4) {
-        int turn = fabsf(z[1] - z[3]) < fabsf(z[0] - z[2]);
-        scene_zbuffer_triangle(&e->buffer, c[turn], c[turn + 1], c[turn + 2]);
-        scene_zbuffer_triangle(&e->buffer, c[turn], c[turn + 2], c[(turn + 3) & 3]);
-    } else if (there == 3) {
-        scene_zbuffer_triangle(&e->buffer, c[(missing + 1) & 3], c[(missing + 2) & 3], c[(missing + 3) & 3]);
-    }
+    scene_zbuffer_triangle(&e->buffer, &e->corners[at[first]], &e->corners[at[(first + 1) & 3]],
+                           &e->corners[at[(first + 2) & 3]]);
 }
 
-/* A strip hanging from the vertices k, k + stride, ...: `drop` metres deep, or down to the foot of a wall. */
-typedef struct strip {
-    int first, stride, count; /* count: cells */
+/* A curtain from the vertices a and b down by `drop` metres, or, as a wall that looks towards (east, north), to the
+ * model's foot. */
+typedef struct curtain {
     bool wall;
-    float east, north; /* of a wall: where it looks */
+    float east, north;
     double drop;
-} strip;
+} curtain;
 
-static void hang(const scene *s, const easel *e, const strip *t, int k, scene_corner *top, scene_corner *bottom)
+static void hang(const scene *s, const easel *e, const curtain *t, int k, scene_corner *top, scene_corner *bottom)
 {
-    int i = k % SCENE_GRID, j = k / SCENE_GRID;
-    double z = (double)e->heights[k] * s->ground.metres;
     *top = e->corners[k];
     if (t->wall) {
-        top->height = NAN;
+        top->height = NAN; /* says that the slopes are a direction */
         top->east = t->east;
         top->north = t->north;
     }
     *bottom = *top;
-    see(s, e->x[i], e->y[j], t->wall ? s->foot : z - t->drop, bottom);
+    double z = t->wall ? s->foot : (double)e->heights[k] * s->ground.metres - t->drop;
+    see(s, e->x[k % SCENE_GRID], e->y[k / SCENE_GRID], z, bottom);
 }
 
-static void draw_strip(const scene *s, easel *e, const strip *t)
+static void draw_curtain(const scene *s, easel *e, const curtain *t, int a, int b)
 {
-    for (int n = 0; n < t->count; n++) {
-        int a = t->first + n * t->stride, b = a + t->stride;
-        if (isnan(e->heights[a]) || isnan(e->heights[b]))
-            continue;
-        scene_corner top[2], bottom[2];
-        hang(s, e, t, a, &top[0], &bottom[0]);
-        hang(s, e, t, b, &top[1], &bottom[1]);
-        scene_zbuffer_triangle(&e->buffer, &top[0], &top[1], &bottom[1]);
-        scene_zbuffer_triangle(&e->buffer, &top[0], &bottom[1], &bottom[0]);
-    }
+    if (isnan(e->heights[a]) || isnan(e->heights[b]))
+        return;
+    scene_corner top[2], bottom[2];
+    hang(s, e, t, a, &top[0], &bottom[0]);
+    hang(s, e, t, b, &top[1], &bottom[1]);
+    scene_zbuffer_triangle(&e->buffer, &top[0], &top[1], &bottom[1]);
+    scene_zbuffer_triangle(&e->buffer, &top[0], &bottom[1], &bottom[0]);
 }
 
-/* Walls on the raster's sides, skirts elsewhere: those hide the hair-fine gaps at tiles of another step. A skirt is as
- * deep as a cell is long, and hence about a pixel. */
-static void draw_sides(const scene *s, easel *e, scene_tile_id id, int columns, int rows)
+/* Hides the hair-fine gaps at tiles of another step: as deep as a cell is long, and hence about a pixel. */
+static void draw_skirts(const scene *s, easel *e, scene_tile_id id, int columns, int rows)
 {
     const scene_lattice *l = &s->pyramid.lattices[id.step];
-    double drop = ldexp(fmin(s->ground.cell_x, s->ground.cell_y), id.step);
+    const curtain skirt = {.drop = ldexp(fmin(s->ground.cell_x, s->ground.cell_y), id.step)};
     int corner = SCENE_GRID + 1;
-    strip sides[4] = {{.first = corner, .stride = 1, .count = columns, .north = 1},
-                      {.first = corner + rows * SCENE_GRID, .stride = 1, .count = columns, .north = -1},
-                      {.first = corner, .stride = SCENE_GRID, .count = rows, .east = -1},
-                      {.first = corner + columns, .stride = SCENE_GRID, .count = rows, .east = 1}};
+    const int first[4] = {corner, corner + rows * SCENE_GRID, corner, corner + columns};
     const bool end[4] = {id.row == 0, id.row * SCENE_TILE + rows == l->height - 1, id.column == 0,
                          id.column * SCENE_TILE + columns == l->width - 1};
     for (int k = 0; k < 4; k++) {
-        sides[k].drop = drop;
-        sides[k].wall = end[k];
-        if (!end[k] || s->walls)
-            draw_strip(s, e, &sides[k]);
+        int stride = k < 2 ? 1 : SCENE_GRID, count = k < 2 ? columns : rows;
+        for (int n = 0; n < count && !end[k]; n++)
+            draw_curtain(s, e, &skirt, first[k] + n * stride, first[k] + (n + 1) * stride);
     }
+}
+
+/* A wall on the edge from vertex k on between two cells, if only one of them is drawn; `rim`: it is on the raster's
+ * side, and so looks straight outwards. Rims of voids are stairs, whose every step would be lit another way: they look
+ * nowhere.
+ */
+static void draw_wall(const scene *s, easel *e, int k, bool along_row, bool rim)
+{
+    int stride = along_row ? 1 : SCENE_GRID, before = k - (along_row ? SCENE_GRID : 1);
+    bool here = missing_corner(e, k) >= 0;
+    if (here == (missing_corner(e, before) >= 0))
+        return;
+    curtain wall = {.wall = true};
+    if (rim && along_row)
+        wall.north = here ? 1 : -1;
+    else if (rim)
+        wall.east = here ? -1 : 1;
+    draw_curtain(s, e, &wall, k, k + stride);
+}
+
+/* Walls around all that is drawn: the raster's sides and the rims of voids. */
+static void draw_walls(const scene *s, easel *e, scene_tile_id id, int columns, int rows)
+{
+    const scene_lattice *l = &s->pyramid.lattices[id.step];
+    int64_t x = id.column * SCENE_TILE - 1, y = id.row * SCENE_TILE - 1; /* of the grid's first vertex */
+    for (int j = 1; j <= rows + 1; j++)
+        for (int i = 1; i <= columns + 1; i++) {
+            int k = j * SCENE_GRID + i;
+            if (i <= columns)
+                draw_wall(s, e, k, true, y + j == 0 || y + j == l->height - 1);
+            if (j <= rows)
+                draw_wall(s, e, k, false, x + i == 0 || x + i == l->width - 1);
+            int missing = i <= columns && j <= rows ? missing_corner(e, k) : 4;
+            if (missing < 0 || missing == 4)
+                continue;
+            const int at[4] = {k, k + 1, k + SCENE_GRID + 1, k + SCENE_GRID};
+            const curtain wall = {.wall = true};
+            draw_curtain(s, e, &wall, at[(missing + 1) & 3], at[(missing + 3) & 3]);
+        }
+}
+
+static bool has_rim(const easel *e, int columns, int rows)
+{
+    for (int j = 0; j <= rows + 2; j++)
+        for (int i = 0; i <= columns + 2; i++)
+            if (isnan(e->heights[j * SCENE_GRID + i]))
+                return true;
+    return false;
 }
 
 static void draw_tile(const scene *s, easel *e, const tile *t)
@@ -384,7 +437,9 @@ static void draw_tile(const scene *s, easel *e, const tile *t)
     for (int j = 1; j <= rows; j++)
         for (int i = 1; i <= columns; i++)
             draw_cell(e, j * SCENE_GRID + i);
-    draw_sides(s, e, t->id, columns, rows);
+    draw_skirts(s, e, t->id, columns, rows);
+    if (s->walls && has_rim(e, columns, rows))
+        draw_walls(s, e, t->id, columns, rows);
 }
 
 static bool worth_drawing(const scene_zbuffer *z, const scene_outline *o)
@@ -413,15 +468,28 @@ static scene_rgb fragment_colour(const scene *s, const scene_fragment *f, double
     scene_rgb colour;
     if (isnan(f->height)) {
         const scene_rgb stone = {0.50f, 0.47f, 0.44f};
-        float steep = 1e3f;
-        colour = scene_lit(&s->light, stone, -f->east * steep, -f->north * steep, 1);
+        const float steep = 1e3f, dim = 0.5f;
+        bool somewhere = f->east != 0 || f->north != 0;
+        colour = somewhere ? scene_lit(&s->light, stone, -f->east * steep, -f->north * steep, 1)
+                           : (scene_rgb){stone.r * dim, stone.g * dim, stone.b * dim};
     } else {
         colour = scene_lit(&s->light, scene_palette_at(&s->palette, f->height), f->east, f->north, 1);
     }
+    if (s->haze == 0)
+        return colour;
     const scene_rgb air = {0.66f, 0.74f, 0.83f};
     double distance = 1 / ((double)f->nearness * s->haze);
     float lost = (float)(distance * distance / (1 + distance * distance));
     return scene_mix(colour, air, isnan(lost) ? 1 : lost);
+}
+
+/* A threshold in (-0.5, 0.5) steps of a byte, by position: a slow gradient comes out without bands. */
+static float dither(int64_t x, int64_t y)
+{
+    uint32_t h = (uint32_t)x * 0x9e3779b1u ^ (uint32_t)y * 0x85ebca77u;
+    h = (h ^ h >> 15) * 0x2c1b3c6du;
+    h = (h ^ h >> 12) * 0x297a2d39u;
+    return ((float)((h ^ h >> 15) >> 8) + 0.5f) / 16777216 - 0.5f;
 }
 
 static void resolve(const scene *s, const scene_zbuffer *z, int64_t left, int64_t top)
@@ -429,12 +497,17 @@ static void resolve(const scene *s, const scene_zbuffer *z, int64_t left, int64_
     for (int y = 0; y < z->height / SUPER; y++)
         for (int x = 0; x < z->width / SUPER; x++) {
             scene_rgb sum = {0, 0, 0};
+            bool air = true;
             for (int k = 0; k < SUPER * SUPER; k++) {
                 int u = x * SUPER + k % SUPER, v = y * SUPER + k / SUPER;
-                scene_rgb c = fragment_colour(s, &z->fragments[v * z->width + u], z->left + u + 0.5, z->top + v + 0.5);
+                const scene_fragment *f = &z->fragments[v * z->width + u];
+                scene_rgb c = fragment_colour(s, f, z->left + u + 0.5, z->top + v + 0.5);
+                air = air && !(f->nearness > 0);
                 sum = (scene_rgb){sum.r + c.r, sum.g + c.g, sum.b + c.b};
             }
             const float share = 1.0f / (SUPER * SUPER);
+            float blur = air ? dither(left + x, top + y) * (SUPER * SUPER) / 127 : 0;
+            sum = (scene_rgb){sum.r + blur * 0.8f, sum.g + blur * 0.8f, sum.b + blur * 0.8f};
             unsigned char *out = s->picture->rgba + ((top + y) * s->picture->width + left + x) * 4;
             out[0] = scene_encode(sum.r * share);
             out[1] = scene_encode(sum.g * share);
@@ -532,7 +605,6 @@ static void measure(scene *s, scene_box *box)
     s->low = (double)all.low * s->ground.metres;
     s->high = (double)all.high * s->ground.metres;
     s->foot = s->low - 0.03 * fmin(east, north) - 0.08 * (s->high - s->low);
-    s->haze = 2.2 * hypot(2 * east, 2 * north) + 2 * (s->high - s->low);
     *box = (scene_box){{-east, -north, s->foot}, {east, north, s->high}};
 }
 
@@ -569,6 +641,8 @@ static tl_status prepare(scene *s, const tl_preview_options *o, tl_error *error)
     if (!(s->low <= s->high))
         return tl_fail(error, TL_ERROR_DATA, "%s: has no valid heights, so there is nothing to look at", info->name);
     s->walls = !o->view_given;
+    if (o->view_given)
+        s->haze = 1.8 * hypot(box.high[0] - box.low[0], box.high[1] - box.low[1]);
     tl_status status = place_camera(s, o, exaggeration, &box, error);
     if (status != TL_OK)
         return status;
@@ -578,7 +652,9 @@ static tl_status prepare(scene *s, const tl_preview_options *o, tl_error *error)
     s->ground.eye[1] = s->camera.eye[1];
     s->ground.rise = outside_of(s->camera.eye[2], s->low, s->high);
     s->ground.per_metre = SUPER / s->camera.focal / cell;
-    scene_light_init(&s->light, o->sun_azimuth, o->sun_elevation);
+    /* by default from behind the shoulder of an eye in the south */
+    bool given = o->sun_azimuth != 0 || o->sun_elevation != 0;
+    scene_light_init(&s->light, given ? o->sun_azimuth : 235, given ? o->sun_elevation : 40);
     scene_encode_prepare();
     return choose_colours(s, o, error);
 }

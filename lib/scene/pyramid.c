@@ -7,7 +7,7 @@
 #include <math.h>
 #include <string.h>
 
-enum { BASE_CELLS = 4096, BLOCK = 11, TILE_LOG = 6 };
+enum { BASE_CELLS = 4096, SQUARE_LOG = 11, TILE_LOG = 6 };
 
 static int64_t vertices(int64_t samples, int step)
 {
@@ -92,62 +92,84 @@ static tl_status read_lattice(const tl_source *source, scene_lattice *l, tl_erro
 
 /* ---- the whole raster ---- */
 
-static void bound(scene_bounds *b, const scene_lattice *l)
+/* Bounds of the samples x0 ... x1, y0 ... y1, as far as the lattice holds them. */
+static scene_bounds bound(const scene_lattice *l, int64_t x0, int64_t x1, int64_t y0, int64_t y1)
 {
-    size_t count = (size_t)(l->window.width * l->window.height);
-    *b = (scene_bounds){INFINITY, -INFINITY};
-    for (size_t i = 0; i < count; i++) {
-        b->low = l->heights[i] < b->low ? l->heights[i] : b->low;
-        b->high = l->heights[i] > b->high ? l->heights[i] : b->high;
+    scene_bounds b = {INFINITY, -INFINITY};
+    const tl_window w = l->window;
+    x0 = tl_int64_max(x0, w.x);
+    x1 = tl_int64_min(x1, w.x + w.width - 1);
+    y1 = tl_int64_min(y1, w.y + w.height - 1);
+    for (int64_t y = tl_int64_max(y0, w.y); y <= y1; y++) {
+        const float *row = l->heights + (y - w.y) * w.width - w.x;
+        for (int64_t x = x0; x <= x1; x++) {
+            b.low = row[x] < b.low ? row[x] : b.low;
+            b.high = row[x] > b.high ? row[x] : b.high;
+        }
     }
+    return b;
 }
 
-/* Vertices of the base in block k of one axis; the last block has the last vertex too. */
-static void block_span(int64_t block, int64_t blocks, int cells_log, int64_t count, int64_t *first, int64_t *size)
+/* Bounds of the blocks in a square, with all the samples that vertices of the base in them are made of. */
+static void bound_blocks(scene_pyramid *p, const scene_lattice *samples, int64_t column, int64_t row)
 {
-    *first = block << cells_log;
-    int64_t end = block == blocks - 1 ? count : tl_int64_min(count, (block + 1) << cells_log);
-    *size = end - *first;
+    const tl_source_info *info = &p->source->info;
+    int64_t size = INT64_C(1) << p->block, each = INT64_C(1) << (p->square - p->block), margin = INT64_C(1) << p->base;
+    int64_t columns = tl_div_up(info->width - 1, size), rows = tl_div_up(info->height - 1, size);
+    for (int64_t y = row * each; y < tl_int64_min(rows, (row + 1) * each); y++)
+        for (int64_t x = column * each; x < tl_int64_min(columns, (column + 1) * each); x++)
+            p->bounds[0][y * columns + x] =
+                bound(samples, x * size - margin, (x + 1) * size + margin, y * size - margin, (y + 1) * size + margin);
 }
 
-static tl_status read_block(void *context, tl_parallel *loop, uint64_t item, unsigned worker, tl_error *error)
+/* Vertices of the base in square k of one axis; the last square has the last vertex too. */
+static void square_span(int64_t square, int cells_log, int64_t count, int64_t *first, int64_t *size)
 {
-    (void)loop;
-    (void)worker;
-    scene_pyramid *p = context;
-    scene_lattice *base = &p->lattices[p->base];
-    int64_t columns = p->block_columns[0], column = (int64_t)item % columns, row = (int64_t)item / columns;
-    int64_t rows = tl_div_up(p->source->info.height - 1, INT64_C(1) << p->block);
-    tl_window w;
-    block_span(column, columns, p->block - p->base, base->width, &w.x, &w.width);
-    block_span(row, rows, p->block - p->base, base->height, &w.y, &w.height);
-    /* one vertex more each way: the block's bounds then hold for all its samples, at every step below the base */
-    int64_t right = tl_int64_min(base->width, w.x + w.width + 1),
-            bottom = tl_int64_min(base->height, w.y + w.height + 1);
-    tl_window wide = {w.x, w.y, right - w.x, bottom - w.y};
-    scene_lattice local[SCENE_STEPS];
-    memcpy(local, p->lattices, sizeof local);
-    for (int k = 0; k <= p->base; k++)
-        local[k].heights = NULL;
-    local[p->base].window = wide;
-    for (int k = p->base - 1; k >= 0; k--)
-        local[k].window = finer(local[k + 1].window, &local[k]);
-    tl_status status = TL_OK;
-    for (int k = 0; k <= p->base && status == TL_OK; k++) {
-        status = hold(&local[k], local[k].window, error);
+    *first = square << cells_log;
+    int64_t end = (square + 1) << cells_log;
+    *size = (end >= count - 1 ? count : end) - *first;
+}
+
+/* Fills local[0 ... base] one after the other, each only as long as the next one needs it. */
+static tl_status reduce(scene_pyramid *p, scene_lattice *local, int64_t column, int64_t row, tl_error *error)
+{
+    for (int k = 0; k <= p->base; k++) {
+        tl_status status = hold(&local[k], local[k].window, error);
         if (status == TL_OK && k == 0)
             status = read_lattice(p->source, &local[0], error);
-        else if (status == TL_OK)
+        if (status != TL_OK)
+            return status;
+        if (k == 0) {
+            bound_blocks(p, &local[0], column, row);
+        } else {
             coarsen(&local[k - 1], &local[k]);
-        if (status == TL_OK && k == 0)
-            bound(&p->bounds[0][item], &local[0]);
-        if (k > 0) {
             free(local[k - 1].heights);
             local[k - 1].heights = NULL;
         }
     }
+    return TL_OK;
+}
+
+static tl_status read_square(void *context, tl_parallel *loop, uint64_t item, unsigned worker, tl_error *error)
+{
+    (void)loop;
+    (void)worker;
+    scene_pyramid *p = context;
+    scene_lattice *base = &p->lattices[p->base], local[SCENE_STEPS];
+    int64_t columns = tl_div_up(p->source->info.width - 1, INT64_C(1) << p->square);
+    int64_t column = (int64_t)item % columns, row = (int64_t)item / columns;
+    tl_window w;
+    square_span(column, p->square - p->base, base->width, &w.x, &w.width);
+    square_span(row, p->square - p->base, base->height, &w.y, &w.height);
+    memcpy(local, p->lattices, sizeof local);
+    local[p->base].window = w;
+    for (int k = 0; k <= p->base; k++)
+        local[k].heights = NULL;
+    for (int k = p->base - 1; k >= 0; k--)
+        local[k].window = finer(local[k + 1].window, &local[k]);
+    tl_status status = reduce(p, local, column, row, error);
     for (int64_t y = 0; y < w.height && status == TL_OK; y++)
-        memcpy(base->heights + (w.y + y) * base->width + w.x, local[p->base].heights + y * wide.width,
+        memcpy(base->heights + (w.y + y) * base->width + w.x, local[p->base].heights + y * w.width,
                (size_t)w.width * sizeof *base->heights);
     for (int k = 0; k <= p->base; k++)
         free(local[k].heights);
@@ -189,14 +211,14 @@ static tl_status build(scene_pyramid *p, const tl_run *run, tl_error *error)
     tl_status status = allocate_bounds(p, error);
     for (int k = p->base; k <= p->top && status == TL_OK; k++)
         status = hold(&p->lattices[k], whole(&p->lattices[k]), error);
-    int64_t size = INT64_C(1) << p->block;
-    uint64_t blocks = (uint64_t)(tl_div_up(info->width - 1, size) * tl_div_up(info->height - 1, size));
+    int64_t size = INT64_C(1) << p->square, block = INT64_C(1) << p->block;
+    uint64_t squares = (uint64_t)(tl_div_up(info->width - 1, size) * tl_div_up(info->height - 1, size));
     if (status == TL_OK)
-        status = tl_parallel_for(run, blocks, (uint64_t)(info->width * info->height), read_block, p, error);
+        status = tl_parallel_for(run, squares, (uint64_t)(info->width * info->height), read_square, p, error);
     for (int k = p->base + 1; k <= p->top && status == TL_OK; k++)
         coarsen(&p->lattices[k - 1], &p->lattices[k]);
     for (int k = 1; k < p->block_levels && status == TL_OK; k++) {
-        int64_t finer_size = size << (k - 1);
+        int64_t finer_size = block << (k - 1);
         merge_bounds(p, k, tl_div_up(info->width - 1, finer_size), tl_div_up(info->height - 1, finer_size));
     }
     return status;
@@ -215,10 +237,10 @@ tl_status scene_pyramid_init(scene_pyramid *pyramid, const tl_source *source, co
         pyramid->lattices[k].width = vertices(source->info.width, k);
         pyramid->lattices[k].height = vertices(source->info.height, k);
     }
-    /* blocks of 2048 samples at most, so that rasters of any size are read in bounded windows, but of a vertex at least
-     */
-    pyramid->block = pyramid->base + TILE_LOG < BLOCK ? pyramid->base + TILE_LOG : BLOCK;
-    pyramid->block = pyramid->block < pyramid->base ? pyramid->base : pyramid->block;
+    /* read in squares of 2048 samples, whatever the raster's size, but of a cell of the base at least; bounds are those
+     * of the base's tiles where a square holds such */
+    pyramid->square = pyramid->base > SQUARE_LOG ? pyramid->base : SQUARE_LOG;
+    pyramid->block = pyramid->base + TILE_LOG < pyramid->square ? pyramid->base + TILE_LOG : pyramid->square;
     tl_status status = build(pyramid, run, error);
     if (status != TL_OK)
         scene_pyramid_finish(pyramid);

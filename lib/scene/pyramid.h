@@ -27,7 +27,8 @@ typedef struct scene_pyramid {
     const tl_source *source;
     int base, top;                       /* lattices base ... top are held whole; top has at most one tile */
     scene_lattice lattices[SCENE_STEPS]; /* heights NULL below base */
-    int block;                           /* log2 of the samples on a side of the smallest blocks with bounds */
+    int square;                          /* log2 of the samples on a side of the squares in which the source is read */
+    int block;                           /* the same of the smallest blocks with bounds */
     int block_levels;
     int64_t block_columns[SCENE_STEPS];
     scene_bounds *bounds[SCENE_STEPS]; /* [k]: of blocks of 2^(block + k) samples */
