@@ -5,11 +5,11 @@
 #include <math.h>
 
 /* Needs cmocka.h before it. False for NaN. */
-#define assert_near(value, expected, tolerance)                                                                        \
-    do {                                                                                                               \
-        double near_value = (value), near_expected = (expected), near_tolerance = (tolerance);                         \
-        if (!(fabs(near_value - near_expected) <= near_tolerance))                                                     \
-            fail_msg("%s is %.17g, not %.17g to %g", #value, near_value, near_expected, near_tolerance);               \
+#define assert_near(value, expected, tolerance)                                                          \
+    do {                                                                                                 \
+        double near_value = (value), near_expected = (expected), near_tolerance = (tolerance);           \
+        if (!(fabs(near_value - near_expected) <= near_tolerance))                                       \
+            fail_msg("%s is %.17g, not %.17g to %g", #value, near_value, near_expected, near_tolerance); \
     } while (0)
 
 #endif
