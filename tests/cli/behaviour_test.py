@@ -1,0 +1,727 @@
+#!/usr/bin/env python3
+"""What the program does to files, signals, terminals and memory: behaviour_test.py PROGRAM [--update] [NAME...]
+
+--update pins the heights that are made now, in tests/golden/heights.sha256.
+"""
+import array
+import hashlib
+import json
+import math
+import os
+import pty
+import re
+import resource
+import select
+import signal
+import subprocess
+import sys
+import time
+
+sys.dont_write_bytecode = True  # the sources may lie in a folder that must stay clean
+from harness import (EXAMPLE, ROOT, Skip, default_signals, expect, is_sanitized, run_tests, sha256, shared, snapshot, tool)
+from raster_files import read_exr, read_glb, read_obj, read_ply, read_png16, read_tiff, same, write_tiff
+
+PINNED = os.path.join(ROOT, "tests", "golden", "heights.sha256")
+UTM = {"epsg": 32611, "origin": (400000.0, 3800000.0), "cell": (30.0, 30.0)}
+FORMATS = ("exr", "tif", "png", "glb", "obj", "ply")
+
+
+def wave(width, height):
+    """Rough enough that its roughness can be measured, exact in float32 and the same on every machine."""
+    state, values = 1, []
+    for k in range(width * height):
+        state = (state * 1103515245 + 12345) & 0x7fffffff
+        i, j = k % width, k // width
+        values.append(200 + (i * j % 97) / 8 + abs(i - j) / 4 + (state >> 24) / 64)
+    return values
+
+
+def write_dem(case, name="dem.tif", width=70, height=50, point=False, holes=False):
+    values = wave(width, height)
+    if holes:
+        values = [math.nan if k % 89 < 3 or k % width < 2 else z for k, z in enumerate(values)]
+    write_tiff(case.path(name), width, height, values, point=point, **UTM)
+    return array.array("f", values)
+
+
+# ---- equal bytes ----
+
+def equal_bytes(name, *command):
+    """The same command with 1, 2 and 5 threads, and again with 2, makes the same file."""
+    def test(case):
+        made = {}
+        for run, threads in enumerate((1, 2, 5, 2)):
+            case.run(*command, "--threads", threads, "-q", "-o", f"{run}.{name}")
+            files = [f"{run}.{name}"] + ([f"{run}.json"] if name == "png" else [])
+            made[run] = [sha256(case.path(file)) for file in files]
+            for file in files:
+                os.remove(case.path(file))
+        expect(len(set(map(tuple, made.values()))) == 1, f"{command}: different bytes: {made}")
+
+    test.name = f"equalBytesForAnyThreads_{command[0]}_{name}"
+    return test
+
+
+def heights_of(case, *command):
+    case.run(*command, "--compression", "none", "-q", "-o", "pinned.exr")
+    digest = hashlib.sha256(read_exr(case.path("pinned.exr")).values.tobytes()).hexdigest()
+    os.remove(case.path("pinned.exr"))
+    return digest
+
+
+def pinned_heights(case):
+    """Heights and triangles are the same in every build: sanitized or not, with AVX2 or without. What is hashed comes from no
+    other library, whose version might change it."""
+    write_dem(case, "holes.tif", holes=True)
+    write_dem(case, "point.tif", point=True)
+    commands = {
+        "synth-stationary": ("synth", EXAMPLE, "--levels", 2),
+        "synth-square": ("synth", EXAMPLE, "--levels", 2, "--scheme", "square", "--seed", 11),
+        "synth-smooth": ("synth", "point.tif", "--levels", 4, "--hurst", 0.95, "--delta", 3),
+        "synth-rough-holes": ("synth", "holes.tif", "--levels", 3, "--hurst", 0.15, "--seed", 5),
+        "noise-stationary": ("noise", "--size", 300, "--hurst", 0.3, "--seed", 2),
+        "noise-square": ("noise", "--size", 129, "--hurst", 0.8, "--scheme", "square"),
+    }
+    found = {name: heights_of(case, *command) for name, command in commands.items()}
+    for bound in (1, 20):
+        case.run("simplify", EXAMPLE, "-e", bound, "--frame", "pixel", "-q", "-o", f"{bound}.ply")
+        mesh = read_ply(case.path(f"{bound}.ply"))
+        found[f"simplify-{bound}"] = hashlib.sha256(mesh.positions.tobytes() + mesh.indices.tobytes()).hexdigest()
+    if "--update" in sys.argv:
+        with open(PINNED, "w", encoding="ascii") as file:
+            file.writelines(f"{digest}  {name}\n" for name, digest in sorted(found.items()))
+    with open(PINNED, encoding="ascii") as file:
+        want = {name: digest for digest, name in (line.split() for line in file)}
+    for name in sorted(want.keys() | found.keys()):
+        expect(found.get(name) == want.get(name), f"{name}: {found.get(name)}, pinned is {want.get(name)}")
+
+
+# ---- nothing left behind ----
+
+def lines_then_signal(case, command, count, number, twice=False):
+    """Sends a signal when `count` lines of progress have been read; the exit status. The folder must be as it was, unless the
+    program had finished before."""
+    before = snapshot(case.folder)
+    process = case.start(*command, "--progress", "json", preexec_fn=default_signals)
+    said = b""
+    while said.count(b"\n") < count:
+        byte = process.stderr.read(1)
+        if not byte:
+            break
+        said += byte
+    process.send_signal(number)
+    if twice:
+        time.sleep(0.01)
+        process.send_signal(number)
+    _, rest = process.communicate(timeout=120)
+    if process.returncode != 0:
+        expect(snapshot(case.folder) == before, f"{command}: signal {number} after {count} lines left a file")
+        expect(b"Sanitizer" not in said + rest, (said + rest).decode())
+    return process.returncode, (said + rest).decode()
+
+
+def interrupted(name, number):
+    """In the middle of a synthesis that would take many seconds."""
+    def test(case):
+        for count in (1, 2, 4):
+            status, said = lines_then_signal(case, ("synth", EXAMPLE, "-l", 8 if name != "png" else 6, "-o", f"a.{name}"),
+                                             count, number)
+            expect(status == 130, f"{count} lines: exit status {status}, not 130")
+            expect(said.endswith("\ntalus: interrupted\n"), said)
+
+    test.name = f"leavesNothingWhen{signal.Signals(number).name}_{name}"
+    return test
+
+
+def leaves_nothing_when_interrupted_early(case):
+    """Before the handlers are in place the signal ends the process itself."""
+    for delay in (0, 0.001, 0.003, 0.01, 0.03):
+        before = snapshot(case.folder)
+        process = case.start("synth", EXAMPLE, "-l", 8, "-o", "a.exr", preexec_fn=default_signals)
+        time.sleep(delay)
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=120)
+        expect(process.returncode in (130, -signal.SIGINT), f"after {delay} s: exit status {process.returncode}")
+        expect(snapshot(case.folder) == before, f"after {delay} s: a file was left")
+
+
+def leaves_nothing_when_interrupted_twice(case):
+    status, _ = lines_then_signal(case, ("synth", EXAMPLE, "-l", 8, "-o", "a.exr"), 2, signal.SIGINT, twice=True)
+    expect(status in (130, -signal.SIGINT), f"exit status {status}")
+
+
+def leaves_nothing_or_all_when_a_mesh_is_interrupted(case):
+    for name in ("glb", "obj", "ply"):
+        for count in (1, 2):
+            status, _ = lines_then_signal(case, ("synth", EXAMPLE, "-l", 1, "-o", f"a.{name}"), count, signal.SIGTERM)
+            expect(status in (0, 130), f"{name}: exit status {status}")
+            if status == 0:  # the mesh was there before the signal
+                {"glb": read_glb, "obj": read_obj, "ply": read_ply}[name](case.path(f"a.{name}"))
+                os.remove(case.path(f"a.{name}"))
+
+
+def leaves_nothing_when_killed(case):
+    try:
+        os.close(os.open(case.folder, os.O_TMPFILE | os.O_RDWR))
+    except (AttributeError, OSError):
+        raise Skip("this file system has no unnamed files")
+    for name in ("exr", "tif", "png"):
+        status, _ = lines_then_signal(case, ("synth", EXAMPLE, "-l", 6, "-o", f"a.{name}"), 2, signal.SIGKILL)
+        expect(status == -signal.SIGKILL, f"exit status {status}")
+
+
+def leaves_the_old_file_when_interrupted(case):
+    with open(case.path("a.exr"), "w", encoding="ascii") as file:
+        file.write("precious")
+    status, _ = lines_then_signal(case, ("synth", EXAMPLE, "-l", 8, "--overwrite", "-o", "a.exr"), 2, signal.SIGINT)
+    expect(status == 130, f"exit status {status}")
+
+
+def command_for(name):
+    return ("simplify", EXAMPLE, "-e", 5) if name in ("glb", "obj", "ply") else ("synth", EXAMPLE, "-l", 1)
+
+
+def full_sizes(case):
+    sizes = {}
+    for name in FORMATS:
+        case.run(*command_for(name), "-q", "-o", f"full.{name}")
+        sizes[name] = os.path.getsize(case.path(f"full.{name}"))
+    return sizes
+
+
+def tells_a_file_size_limit(case):
+    """ulimit -f, whose signal must not kill the program; up to the last byte, where a buffer may hide the failure."""
+    for name, size in full_sizes(case).items():
+        for limit in (0, 1000, size // 2, size - 1):
+            result = case.run(*command_for(name), "-o", f"a.{name}", status=1,
+                              preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)))
+            expect(result.err == f"talus: a.{name}: cannot write: File too large\n"
+                   or (name == "png" and result.err == "talus: a.json: cannot write: File too large\n"),
+                   f"limit {limit} of {size}: {result.err}")
+
+
+def mounted_run(case, size, *command):
+    """Runs the program in a small file system of its own, which only it sees; what it said and left."""
+    script = f'mount -t tmpfs -o size={size} none "$1" && cd "$1" && shift && "$@"; echo "status $?"; ls -A .'
+    os.makedirs(case.path("disk"), exist_ok=True)
+    for unshare in (["unshare", "-m"], ["unshare", "-r", "-m"]):
+        try:
+            found = subprocess.run([tool("unshare"), *unshare[1:], "sh", "-c", script, "sh", case.path("disk"), case.program,
+                                    *map(str, command)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, timeout=120,
+                                   check=False)
+        except OSError as error:
+            raise Skip(f"unshare: {error}")
+        if b"status" in found.stdout and b"mount:" not in found.stderr:
+            return found.stdout.decode(), found.stderr.decode()
+    raise Skip("mounting is not permitted here")
+
+
+def tells_a_full_disk(case):
+    for name, size in full_sizes(case).items():
+        for share in (0.05, 0.5, 0.97):
+            pages = max(1, int(size * share) // 4096)
+            out, err = mounted_run(case, pages * 4096, *command_for(name), "-o", f"a.{name}")
+            expect(out == "status 1\n", f"{name} on {pages} pages: {out}{err}")
+            expect(re.fullmatch(r"talus: a\.\w+: cannot write: No space left on device\n", err), f"{name}: {err}")
+
+
+def tells_an_unwritable_folder(case):
+    with open(EXAMPLE, "rb") as example, open(case.path("dem.tif"), "wb") as copy:
+        copy.write(example.read())
+    os.mkdir(case.path("closed"), 0o555)
+    nobody = (lambda: os.setuid(65534)) if os.getuid() == 0 else None
+    try:
+        case.start("version", preexec_fn=nobody).communicate()
+    except OSError:
+        raise Skip("the program's folder is closed to other users")
+    for name in FORMATS:
+        result = case.run("synth", "dem.tif", "-l", 0, "-o", f"closed/a.{name}", status=1, preexec_fn=nobody)
+        expect(result.err == f"talus: closed/a.{name}: cannot write: Permission denied\n", result.err)
+
+
+def refuses_to_replace(case):
+    for name in FORMATS:
+        case.run(*command_for(name), "-q", "-o", f"a.{name}")
+        result = case.run(*command_for(name), "-o", f"a.{name}", status=1)
+        expect("exists already" in result.err, result.err)
+        case.run(*command_for(name), "-q", "--overwrite", "-o", f"a.{name}")
+    os.remove(case.path("a.png"))
+    result = case.run(*command_for("png"), "-o", "a.png", status=1)
+    expect("a.json: exists already" in result.err, result.err)
+
+
+# ---- streams ----
+
+def tells_a_full_stdout(case):
+    for command in (("info", EXAMPLE), ("info", EXAMPLE, "--json"), ("help",), ("help", "synth"), ("version",)):
+        if os.path.exists("/dev/full"):
+            with open("/dev/full", "wb") as full:
+                result = case.run(*command, status=1, stdout=full)
+            expect(result.err == "talus: cannot write to standard output: No space left on device\n", result.err)
+        result = case.run(*command, status=1, stdout=None, preexec_fn=lambda: os.close(1))
+        expect(result.err == "talus: cannot write to standard output: Bad file descriptor\n", result.err)
+
+
+def tells_a_broken_pipe(case):
+    reader, writer = os.pipe()
+    os.close(reader)
+    result = case.run("info", EXAMPLE, status=1, stdout=writer)
+    os.close(writer)
+    expect(result.err == "talus: cannot write to standard output: Broken pipe\n", result.err)
+
+
+def closed_streams_do_not_go_into_the_output(case):
+    """The next file opened gets the number of a closed stream, and messages with it."""
+    case.run("synth", EXAMPLE, "-l", 1, "-o", "open.exr")
+
+    def close_all():
+        for number in (0, 1, 2):
+            os.close(number)
+
+    process = case.start("synth", EXAMPLE, "-l", 1, "-o", "closed.exr", stdin=None, stdout=None, stderr=None,
+                         preexec_fn=close_all)
+    expect(process.wait(60) == 0, "failed")
+    expect(sha256(case.path("open.exr")) == sha256(case.path("closed.exr")), "different bytes")
+
+
+def on_terminal(case, *command):
+    """What the program writes to a terminal that is its stderr."""
+    master, slave = pty.openpty()
+    process = case.start(*command, stderr=slave, stdout=subprocess.DEVNULL)
+    os.close(slave)
+    said = b""
+    while True:
+        ready, _, _ = select.select([master], [], [], 60)
+        try:
+            part = os.read(master, 65536) if ready else b""
+        except OSError:  # Linux: EIO when the last writer has closed
+            part = b""
+        if not part:
+            break
+        said += part
+    os.close(master)
+    expect(process.wait(60) == 0, said.decode())
+    return said.decode()
+
+
+def bar_only_on_a_terminal(case):
+    command = ("synth", EXAMPLE, "-l", 3, "-o", "a.exr", "--overwrite")
+    said = on_terminal(case, *command)
+    expect(re.search(r"synthesis \[#+\.*\] +\d+ %  [\d.]+ M samples/s", said), repr(said))
+    expect(re.search(r"\r\x1b\[Ka\.exr: 3224 x 2752 samples", said), "the bar is not removed: " + repr(said[-400:]))
+    expect("[#" not in on_terminal(case, *command, "--progress", "none"), "a bar in spite of --progress none")
+    expect(on_terminal(case, *command, "-q") == "", "words in spite of --quiet")
+    piped = case.run(*command).err
+    expect("\r" not in piped and "\x1b" not in piped and "[#" not in piped, repr(piped))
+    expect(piped.startswith("a.exr: 3224 x 2752 samples"), piped)
+
+
+def progress_lines_are_json(case):
+    for name in ("exr", "png", "tif"):
+        stages = {}
+        for line in case.run("synth", EXAMPLE, "-l", 3, "--progress", "json", "-o", f"a.{name}").err.splitlines():
+            if not line.startswith("{"):
+                continue
+            entry = json.loads(line)
+            expect(set(entry) == {"stage", "done", "total", "seconds"}, line)
+            expect(0 <= entry["done"] <= entry["total"] and entry["seconds"] >= 0, line)
+            last = stages.get(entry["stage"], {"done": 0, "seconds": 0, "total": entry["total"]})
+            expect(last["done"] <= entry["done"] and last["seconds"] <= entry["seconds"], f"{name}: goes back: {line}")
+            expect(last["total"] == entry["total"], f"{name}: another total: {line}")
+            stages[entry["stage"]] = entry
+        expect(set(stages) == {"measuring", "synthesis"}, f"{stages}")
+        expect(all(entry["done"] == entry["total"] for entry in stages.values()), f"not to the end: {stages}")
+
+
+def quiet_is_silent(case):
+    for command in (("synth", EXAMPLE, "-l", 1, "-o", "a.exr"), ("noise", "--size", 33, "-o", "b.exr"),
+                    ("simplify", EXAMPLE, "-e", 9, "--verify", "-o", "c.ply"),
+                    ("synth", EXAMPLE, "-l", 1, "--progress", "json", "-o", "d.exr")):
+        result = case.run(*command, "--quiet")
+        expect(result.out == "" and result.err == "", f"{command}: {result.out}{result.err}")
+
+
+# ---- info ----
+
+NUMBER = (int, float)
+SCHEMA = {
+    "name": str, "width": int, "height": int, "level": int, "raster_type": str, "quantum": NUMBER,
+    "georeference": {"located": bool, "sample_transform": [NUMBER] * 6, "extent": [NUMBER] * 4,
+                     "cell_metres": [NUMBER] * 2, "height_unit_metres": NUMBER,
+                     "crs": {"name": str, "epsg": int, "geographic": bool, "wkt": str}},
+    "file": {"type": str, "codec": str, "predictor": int, "layout": str, "block": [int] * 2, "bigtiff": bool,
+             "byte_order": str, "bands": int, "band": int, "nodata": (int, float, type(None)), "scale": NUMBER,
+             "offset": NUMBER, "overviews": int, "bytes": int},
+    "heights": {"low": NUMBER, "high": NUMBER, "mean": NUMBER, "samples": int, "voids": int},
+    "roughness": {"sigma": NUMBER, "hurst": NUMBER},
+    "parameters": dict,
+}
+
+
+def check_schema(value, schema, where="$"):
+    if isinstance(schema, dict):
+        expect(isinstance(value, dict) and set(value) == set(schema), f"{where}: {value}")
+        for key, inner in schema.items():
+            check_schema(value[key], inner, f"{where}.{key}")
+    elif isinstance(schema, list):
+        expect(isinstance(value, list) and len(value) == len(schema), f"{where}: {value}")
+        for item, inner in zip(value, schema):
+            check_schema(item, inner, where)
+    else:
+        expect(isinstance(value, schema) and (schema is bool or not isinstance(value, bool) or schema == dict),
+               f"{where}: {value!r}")
+
+
+def json_keeps_its_schema(case):
+    about = json.loads(case.run("info", EXAMPLE, "--json").out)
+    check_schema(about, SCHEMA)
+    expect((about["width"], about["height"], about["file"]["type"]) == (403, 344, "int16"), f"{about}")
+    case.run("synth", EXAMPLE, "-l", 2, "-s", 4, "-q", "-o", "a.exr")
+    made = json.loads(case.run("info", "a.exr", "--json").out)
+    check_schema({**made, "file": about["file"]}, SCHEMA)
+    expect(made["file"] is None and made["level"] == 0, "an EXR is no GeoTIFF")
+    expect(made["parameters"]["seed"] == "4" and made["parameters"]["levels"] == "2", f"{made['parameters']}")
+    expect(all(abs(a - b) < 1e-9 for a, b in zip(made["georeference"]["extent"], about["georeference"]["extent"])),
+           "the footprint has moved")
+
+
+def names_of_any_bytes(case):
+    """A Latin-1 letter, a newline and a terminal's escape in the name of a file."""
+    name = b"h\xf6he\n\x1b[31m.tif"
+    write_tiff(os.path.join(os.fsencode(case.folder), name), 5, 4, [1.0] * 20, point=True, **UTM)
+    argument = os.fsdecode(name)
+    process = case.start("info", argument)
+    out, err = process.communicate()
+    expect(process.returncode == 0 and out.split(b"\n")[0] == b"h\xf6he??[31m.tif", f"{out}{err}")
+    about = json.loads(case.start("info", argument, "--json").communicate()[0].decode("utf-8"))
+    expect(about["name"] == "h?he\n\x1b[31m.tif", f"{about['name']!r}")
+    want = "h?he??[31m.tif"
+    for ending in FORMATS:
+        expect(case.start("synth", argument, "-l", 1, "-q", "-o", f"a.{ending}").wait() == 0, ending)
+    with open(case.path("a.json"), encoding="utf-8") as file:
+        expect(json.load(file)["parameters"]["input"] == want, "PNG's sidecar")
+    expect(json.loads(case.run("info", "a.exr", "--json").out)["parameters"]["input"] == want, "EXR")
+    expect(want in json.dumps(read_glb(case.path("a.glb")).about["asset"]), "GLB")
+    expect(f"comment input: {want}" in read_ply(case.path("a.ply")).about, "PLY")
+    missing = case.start("info", argument + "x").communicate()[1]
+    expect(missing == b"talus: h?he??[31m.tifx: cannot read: No such file or directory\n", f"{missing}")
+
+
+# ---- heights ----
+
+def formats_hold_the_same_heights(case):
+    """EXR, GeoTIFF, PNG, in each compression that the readers know; the example's rows run from south to north."""
+    write_dem(case, holes=True)
+    for dem, upside_down in ((EXAMPLE, True), ("dem.tif", False)):
+        command = ("synth", dem, "-l", 1, "-q", "--overwrite")
+        case.run(*command, "--compression", "none", "-o", "a.exr")
+        truth = read_exr(case.path("a.exr"))
+        case.run(*command, "-o", "b.exr")
+        expect(read_exr(case.path("b.exr")).values.tobytes() == truth.values.tobytes(), "EXR: zip and none differ")
+        for kind in ("none", "zip"):
+            case.run(*command, "--compression", kind, "-o", "a.tif")
+            found = read_tiff(case.path("a.tif"))
+            expect((found.width, found.height) == (truth.width, truth.height), "size")
+            for row in range(truth.height):
+                other = truth.height - 1 - row if upside_down else row
+                expect(found.values[other * truth.width:(other + 1) * truth.width].tobytes() ==
+                       truth.values[row * truth.width:(row + 1) * truth.width].tobytes(), f"{kind}: row {row}")
+
+
+def png_within_half_a_step(case):
+    write_dem(case, holes=True)
+    for dem in (EXAMPLE, "dem.tif"):
+        case.run("synth", dem, "-l", 0, "-q", "--overwrite", "--compression", "none", "-o", "a.exr")
+        case.run("synth", dem, "-l", 0, "-q", "--overwrite", "-o", "a.png")
+        truth, picture = read_exr(case.path("a.exr")), read_png16(case.path("a.png"))
+        with open(case.path("a.json"), encoding="utf-8") as file:
+            about = json.load(file)
+        expect((picture.width, picture.height) == (about["width"], about["height"]) == (truth.width, truth.height), "size")
+        # half a step, and the rounding of the double arithmetic on both sides
+        limit = about["scale"] / 2 * (1 + 1e-9) + 1e-12 * max(abs(about["lowest"]), abs(about["highest"]))
+        for value, height in zip(picture.values, truth.values):
+            if math.isnan(height):
+                expect(value == about["void"], f"a void is {value}")
+            else:
+                expect(abs(about["offset"] + about["scale"] * value - height) <= limit, f"{value} for {height}")
+                expect(value != about["void"], "a height is marked void")
+        expect(max(picture.values) == 65535, "the range is not used")
+        valid = [z for z in truth.values if not math.isnan(z)]
+        expect((min(valid), max(valid)) == (about["lowest"], about["highest"]), "the sidecar's range")
+
+
+def expect_samples_kept(dem, width, height, made, step):
+    expect((made.width, made.height) == ((width - 1) * step + 1, (height - 1) * step + 1), "size")
+    for row in range(height):
+        found = made.values[row * step * made.width:row * step * made.width + made.width:step]
+        want = dem[row * width:(row + 1) * width]
+        expect(all(map(same, found, want)), f"row {row} differs from the DEM's")
+
+
+def point_samples_are_kept(case):
+    dem = write_dem(case, point=True)
+    for levels in (0, 1, 3):
+        for scheme in ("stationary", "square"):
+            case.run("synth", "dem.tif", "-l", levels, "--scheme", scheme, "--compression", "none", "--overwrite", "-q",
+                     "-o", "a.exr")
+            expect_samples_kept(dem, 70, 50, read_exr(case.path("a.exr")), 2 ** levels)
+
+
+def point_samples_of_the_andes_are_kept(case):
+    path = shared("dem", "nfong_S33W071.tif")
+    dem = read_tiff(path)
+    case.run("synth", path, "-l", 1, "--compression", "none", "-q", "-o", "a.exr")
+    expect_samples_kept(array.array("f", dem.values), dem.width, dem.height, read_exr(case.path("a.exr")), 2)
+
+
+def area_means_stay_on_their_footprint(case):
+    """An area raster W x H becomes W 2^l x H 2^l cells; gdalinfo judges the place elsewhere."""
+    write_dem(case, point=False)
+    case.run("synth", "dem.tif", "-l", 2, "--compression", "none", "-q", "-o", "a.tif")
+    made = read_tiff(case.path("a.tif"))
+    expect((made.width, made.height) == (280, 200), "size")
+    expect(made.about[33550][:2] == (7.5, 7.5) and made.about[33922] == (0, 0, 0, 400000, 3800000, 0), f"{made.about}")
+
+
+# ---- meshes ----
+
+def radius_of_parallel(latitude):
+    """Metres from the axis of GRS 80's ellipsoid, latitude in degrees."""
+    flattening, phi = 1 / 298.257222101, math.radians(latitude)
+    return 6378137 * math.cos(phi) / math.sqrt(1 - flattening * (2 - flattening) * math.sin(phi) ** 2)
+
+
+def spans(mesh):
+    return [max(mesh.positions[k::3]) - min(mesh.positions[k::3]) for k in range(3)]
+
+
+def faces_down(mesh, up):
+    """The number of triangles whose normal does not point along the axis `up`."""
+    a, b = [(1, 2), (2, 0), (0, 1)][up]
+    wrong, p = 0, mesh.positions
+    for t in range(0, len(mesh.indices), 3):
+        i, j, k = (3 * n for n in mesh.indices[t:t + 3])
+        area = (p[j + a] - p[i + a]) * (p[k + b] - p[i + b]) - (p[j + b] - p[i + b]) * (p[k + a] - p[i + a])
+        wrong += area <= 0
+    return wrong
+
+
+def glb_is_in_metres(case):
+    case.run("synth", EXAMPLE, "-l", 0, "-q", "-o", "a.glb")
+    mesh = read_glb(case.path("a.glb"))
+    expect(len(mesh.positions) == 3 * 403 * 344 and len(mesh.indices) == 3 * 2 * 402 * 343, "number of triangles")
+    expect(faces_down(mesh, 1) == 0, "triangles that face down")
+    # The southern rim is the longest: 402 cells of 1/1200 degree on its parallel, seen from the tangent plane's middle.
+    # A chord of 30 km is shorter than its arc by 30^2 / (24 * 6370^2), 1e-6 of it, and the lift of 1 km of height is 1.6e-4.
+    east = radius_of_parallel(36.4466666667) * math.radians(402 / 1200)
+    expect(abs(spans(mesh)[0] / east - 1) < 2e-4, f"{spans(mesh)[0]} m from west to east, not {east}")
+    # from south to north: 343 cells of the meridian, whose radius of curvature at 36.59 degrees is 6,358 km
+    north = 6358.1e3 * math.radians(343 / 1200)
+    # the corners of the northern rim lie farther north than its middle by the parallel's sagitta, 15 km^2 tan(phi) / 2R
+    sagitta = 15.0e3 ** 2 * math.tan(math.radians(36.6)) / (2 * 6.37e6)
+    expect(abs(spans(mesh)[2] - north) < 2e-4 * north + sagitta, f"{spans(mesh)[2]} m from south to north, not {north}")
+
+
+def frames_agree(case):
+    """The same mesh in each frame and format; a grid of 30 m cells, 2.1 by 1.5 km, in UTM zone 11."""
+    values = write_dem(case, point=True)
+    for name, read in (("glb", read_glb), ("ply", read_ply), ("obj", read_obj)):
+        meshes = {}
+        for frame in ("pixel", "projected", "enu"):
+            case.run("synth", "dem.tif", "-l", 0, "-q", "--frame", frame, "-o", f"{frame}.{name}")
+            meshes[frame] = read(case.path(f"{frame}.{name}"))
+            expect(len(meshes[frame].positions) == 3 * 70 * 50, "vertices")
+        upwards = {frame: 1 if name == "glb" and frame == "enu" else 2 for frame in meshes}
+        expect(faces_down(meshes["enu"], upwards["enu"]) == 0, f"{name}: enu faces down")
+        if name == "glb":
+            continue  # its pixel and projected frames are not right-handed with y up; sizes are judged above
+        expect(faces_down(meshes["projected"], 2) == 0, f"{name}: projected faces down")
+        expect(faces_down(meshes["pixel"], 2) == 0, f"{name}: pixel faces down")
+        expect(spans(meshes["pixel"])[:2] == [69, 49], f"{name}: {spans(meshes['pixel'])}")
+        expect(spans(meshes["projected"])[:2] == [69 * 30, 49 * 30], f"{name}: {spans(meshes['projected'])}")
+        expect(min(meshes["projected"].positions[0::3]) == 400000 and max(meshes["projected"].positions[1::3]) == 3800000,
+               f"{name}: corner")
+        # metres on the ground: UTM's scale 1.1 degrees from the meridian of zone 11 is 0.9996 (1 + 0.0157^2 / 2), and the
+        # grid is turned by 0.6 degrees against east; a diagonal does not see that
+        p = meshes["enu"].positions
+        index = {}
+        for k in range(0, len(p), 3):
+            index[(meshes["pixel"].positions[k], meshes["pixel"].positions[k + 1])] = p[k:k + 3]
+        a, b = index[(0, 0)], index[(69, 49)]
+        ground, grid = math.hypot(a[0] - b[0], a[1] - b[1]), math.hypot(69 * 30, 49 * 30)
+        expect(abs(grid / ground - 0.9996 * (1 + 0.0157 ** 2 / 2)) < 1e-4, f"{name}: {ground} m for {grid} m of grid")
+        for place, found in zip(range(0, len(p), 3), p[2::3]):
+            i, j = (int(n) for n in meshes["pixel"].positions[place:place + 2])
+            want = meshes["pixel"].positions[place + 2]
+            expect(abs(want - values[j * 70 + i]) < 1e-5, f"{name}: height at {i}, {j}")
+
+
+def simplify_keeps_its_word(case):
+    """The printed error is at most the bound, and near it; fewer triangles for larger bounds."""
+    triangles = []
+    for bound in (1, 5, 20):
+        said = case.run("simplify", EXAMPLE, "-e", bound, "--verify", "--frame", "pixel", "-o", f"{bound}.ply").err
+        worst = float(re.search(r"largest error ([\d.e+-]+) at", said).group(1))
+        expect(bound / 2 < worst <= bound, said)
+        expect("138632 samples, 0 uncovered" in said, said)
+        triangles.append(int(re.search(r"(\d+) triangles", said).group(1)))
+        mesh = read_ply(case.path(f"{bound}.ply"))
+        expect(len(mesh.indices) == 3 * triangles[-1], "another number of triangles")
+        expect(faces_down(mesh, 2) == 0, "folded triangles")
+        # without overlap or gap, the triangles' areas add up to the grid's
+        p, area = mesh.positions, 0
+        for t in range(0, len(mesh.indices), 3):
+            i, j, k = (3 * n for n in mesh.indices[t:t + 3])
+            area += abs((p[j] - p[i]) * (p[k + 1] - p[i + 1]) - (p[j + 1] - p[i + 1]) * (p[k] - p[i])) / 2
+        expect(area == 402 * 343, f"area {area}")
+    expect(triangles == sorted(triangles, reverse=True), f"{triangles}")
+
+
+# ---- memory ----
+
+def memory_does_not_grow_with_the_output(case):
+    """From 17 M to 67 M samples the output grows by 200 MB; memory may grow by the longer rows of tiles that are in work,
+    not by the heights: a quarter of the growth is far above the first and far below the second."""
+    if is_sanitized(case.program):
+        raise Skip("a sanitizer's memory is its own")
+    case.run("noise", "--size", 1025, "-q", "-o", "dem.tif")
+    for name, kind in (("exr", "none"), ("tif", "none"), ("exr", "zip")):
+        peaks, sizes = [], []
+        for levels in (2, 3):
+            peaks.append(case.peak_memory("synth", "dem.tif", "-l", levels, "--compression", kind, "--threads", 2,
+                                          "--overwrite", "-o", f"a.{name}"))
+            sizes.append(4 * (1025 * 2 ** levels) ** 2)
+            os.remove(case.path(f"a.{name}"))
+        expect(peaks[1] - peaks[0] < (sizes[1] - sizes[0]) / 4, f"{name} {kind}: peaks {peaks} for {sizes} bytes of heights")
+        expect(peaks[1] < 512 << 20, f"{name} {kind}: {peaks[1] >> 20} MiB")
+
+
+# ---- bad input ----
+
+def bad_files_end_with_one_line(case):
+    """Every malformed TIFF of the collection: an answer or one line, no crash; what is too long to read can be stopped."""
+    folder = os.path.dirname(shared("bad", "INDEX.tsv"))
+    for name in sorted(os.listdir(folder)):
+        if not name.lower().endswith((".tif", ".tiff")):
+            continue
+        process = case.start("info", os.path.join(folder, name), "-t", 1)
+        try:
+            out, err = process.communicate(timeout=5)
+        except subprocess.TimeoutExpired:
+            process.send_signal(signal.SIGINT)
+            out, err = process.communicate(timeout=20)
+            expect(process.returncode == 130, f"{name}: SIGINT: exit status {process.returncode}")
+        expect(process.returncode in (0, 1, 130), f"{name}: exit status {process.returncode}: {err}")
+        if process.returncode == 1:
+            expect(out == b"" and err.startswith(b"talus: ") and err.count(b"\n") == 1, f"{name}: {out}{err}")
+            expect(not re.search(rb"[^\x20-\x7e\n]", err), f"{name}: {err}")
+        expect(b"Sanitizer" not in err and b"runtime error" not in err, f"{name}: {err}")
+
+
+# ---- other eyes ----
+
+def gdal(case, *words):
+    found = subprocess.run([tool(words[0]), *words[1:]], cwd=case.folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+                           timeout=120, check=False)
+    expect(found.returncode == 0, found.stderr.decode())
+    return found.stdout.decode()
+
+
+def gdal_reads_the_geotiff(case):
+    tool("gdalinfo")
+    for point in (False, True):
+        write_dem(case, point=point, holes=True)
+        for levels in (0, 2):
+            command = ("synth", "dem.tif", "-l", levels, "-q", "--overwrite")
+            case.run(*command, "-o", "a.tif")
+            case.run(*command, "--compression", "none", "-o", "a.exr")
+            about = json.loads(gdal(case, "gdalinfo", "-json", "a.tif"))
+            cell = 30 / 2 ** levels
+            # a point is the middle of GDAL's pixel: its raster begins half a pixel before the first sample
+            west, north = (400000 - cell / 2, 3800000 + cell / 2) if point else (400000, 3800000)
+            expect(about["geoTransform"] == [west, cell, 0, north, 0, -cell], f"{about['geoTransform']}")
+            expect(about["metadata"][""]["AREA_OR_POINT"] == ("Point" if point else "Area"), f"{about['metadata']}")
+            expect('ID["EPSG",32611]' in about["coordinateSystem"]["wkt"], "CRS")
+            expect(about["bands"][0]["noDataValue"] == "NaN" or math.isnan(float(about["bands"][0]["noDataValue"])),
+                   "nodata")
+            gdal(case, "gdal_translate", "-q", "-of", "ENVI", "a.tif", "raw")
+            raw = array.array("f")
+            with open(case.path("raw"), "rb") as file:
+                raw.frombytes(file.read())
+            truth = read_exr(case.path("a.exr"))
+            expect(len(raw) == len(truth.values) and all(map(same, raw, truth.values)), "values")
+
+
+def gdal_places_the_example(case):
+    """Rows from south to north: the matrix of the transformation, not tie point and scale."""
+    tool("gdalinfo")
+    case.run("synth", EXAMPLE, "-l", 2, "-q", "-o", "a.tif")
+    before = json.loads(gdal(case, "gdalinfo", "-json", EXAMPLE))
+    after = json.loads(gdal(case, "gdalinfo", "-json", "a.tif"))
+    for corner, place in before["cornerCoordinates"].items():
+        for a, b in zip(place, after["cornerCoordinates"][corner]):
+            expect(abs(a - b) < 1e-9, f"{corner}: {place} became {after['cornerCoordinates'][corner]}")
+    expect(before["coordinateSystem"]["wkt"] == after["coordinateSystem"]["wkt"], "CRS")
+
+
+def openexr_reads_the_exr(case):
+    header = tool("exrheader")
+    write_dem(case)
+    for kind in ("none", "zip", "zips", "piz"):
+        case.run("synth", "dem.tif", "-l", 3, "--compression", kind, "-q", "--overwrite", "-o", "a.exr")
+        said = subprocess.run([header, "a.exr"], cwd=case.folder, stdout=subprocess.PIPE, check=True).stdout.decode()
+        for line in ("Y, 32-bit floating-point", "(0 0) - (559 399)", "tile size 256 by 256", 'gdal:AREA_OR_POINT (type string): "Area"',
+                     'talus:levels (type string): "3"'):
+            expect(line in said, f"{kind}: no '{line}' in {said}")
+
+
+def openimageio_agrees_on_the_range(case):
+    oiiotool = tool("oiiotool")
+    write_dem(case)
+    case.run("synth", "dem.tif", "-l", 3, "--compression", "none", "-q", "-o", "none.exr")
+    truth = read_exr(case.path("none.exr")).values
+    for kind in ("none", "zip", "zips", "piz"):
+        case.run("synth", "dem.tif", "-l", 3, "--compression", kind, "-q", "--overwrite", "-o", "a.exr")
+        said = subprocess.run([oiiotool, "--stats", "a.exr"], cwd=case.folder, stdout=subprocess.PIPE,
+                              check=True).stdout.decode()
+        for word, value in (("Min", min(truth)), ("Max", max(truth))):
+            found = float(re.search(rf"Stats {word}: ([\d.eE+-]+)", said).group(1))
+            expect(abs(found - value) <= 1e-6, f"{kind}: {word} {found}, not {value}")
+
+
+# ---- the table ----
+
+def with_name(function):
+    words = function.__name__.split("_")
+    function.name = words[0] + "".join(word.capitalize() for word in words[1:])
+    return function
+
+
+TESTS = [
+    *(equal_bytes(name, "synth", EXAMPLE, "--levels", 2 if name in ("exr", "tif") else 1) for name in ("exr", "tif", "png")),
+    *(equal_bytes(name, "synth", EXAMPLE, "--levels", 0) for name in ("glb", "obj", "ply")),
+    *(equal_bytes(name, "noise", "--size", 300, "--seed", 9) for name in ("exr", "tif", "glb")),
+    *(equal_bytes(name, "simplify", EXAMPLE, "-e", 3) for name in ("glb", "obj", "ply")),
+    pinned_heights,
+    *(interrupted(name, number) for name in ("exr", "tif", "png") for number in (signal.SIGINT, signal.SIGTERM)),
+    leaves_nothing_when_interrupted_early, leaves_nothing_when_interrupted_twice,
+    leaves_nothing_or_all_when_a_mesh_is_interrupted, leaves_nothing_when_killed, leaves_the_old_file_when_interrupted,
+    tells_a_file_size_limit, tells_a_full_disk, tells_an_unwritable_folder, refuses_to_replace,
+    tells_a_full_stdout, tells_a_broken_pipe, closed_streams_do_not_go_into_the_output,
+    bar_only_on_a_terminal, progress_lines_are_json, quiet_is_silent,
+    json_keeps_its_schema, names_of_any_bytes,
+    formats_hold_the_same_heights, png_within_half_a_step, point_samples_are_kept, point_samples_of_the_andes_are_kept,
+    area_means_stay_on_their_footprint,
+    glb_is_in_metres, frames_agree, simplify_keeps_its_word,
+    memory_does_not_grow_with_the_output, bad_files_end_with_one_line,
+    gdal_reads_the_geotiff, gdal_places_the_example, openexr_reads_the_exr, openimageio_agrees_on_the_range,
+]
+
+
+def main():
+    names = [word for word in sys.argv[2:] if not word.startswith("-")]
+    tests = [test if hasattr(test, "name") else with_name(test) for test in TESTS]
+    sys.exit(run_tests(os.path.abspath(sys.argv[1]), [test for test in tests if not names or test.name in names]))
+
+
+main()
