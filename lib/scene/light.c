@@ -11,12 +11,13 @@ typedef struct stop {
     unsigned hex;
 } stop;
 
-/* Greens of valleys, dry yellows, rock, and pale summits: muted, so that the light carries the shape. */
-static const stop land[] = {{0.00f, 0x85a089}, {0.14f, 0x9ab08b}, {0.30f, 0xbac19b},
-                            {0.46f, 0xd6cdab}, {0.60f, 0xcab496}, {0.74f, 0xb59d86},
-                            {0.87f, 0xbbb0a6}, {0.95f, 0xd7d1ca}, {1.00f, 0xf2f0ec}};
+/* Greens of valleys, dry slopes, rock, and pale summits: muted, so that the light carries the shape, and brighter with
+ * every step, so that no colour looks like a ridge. */
+static const stop land[] = {{0.00f, 0x7d9a84}, {0.18f, 0x95ad8b}, {0.36f, 0xb3ba98}, {0.54f, 0xc9bf9f},
+                            {0.70f, 0xccb69a}, {0.84f, 0xccbcaa}, {0.94f, 0xdcd6ce}, {1.00f, 0xf1efeb}};
 static const stop sea[] = {{0.00f, 0x1f3f6e}, {0.35f, 0x35669a}, {0.70f, 0x659bc0}, {1.00f, 0xb4d6dd}};
-static const stop plain[] = {{0, 0xd9d8d5}, {1, 0xd9d8d5}};
+enum { STOPS_MAX = 8, LAND = sizeof land / sizeof *land, SEA = sizeof sea / sizeof *sea };
+static const unsigned plain = 0xd9d8d5;
 
 /* Depth below which heights cannot be those of dry land, but for the shores of the Dead Sea. */
 static const float sea_depth = -150;
@@ -37,17 +38,37 @@ scene_rgb scene_rgb_of(unsigned hex)
     return (scene_rgb){decode(hex >> 16 & 255), decode(hex >> 8 & 255), decode(hex & 255)};
 }
 
-static scene_rgb on_ramp(const stop *ramp, float t)
+/* Slope of a ramp's channel at stop k: between its neighbours, 0 at the ends. */
+static float tangent(const stop *ramp, const float *values, int k, int last)
 {
-    if (!(t > 0))
-        return scene_rgb_of(ramp[0].hex);
-    if (t >= 1)
-        t = 1;
-    int k = 0;
-    while (t > ramp[k + 1].at)
+    if (k == 0 || k == last)
+        return 0;
+    return (values[1] - values[-1]) / (ramp[k + 1].at - ramp[k - 1].at);
+}
+
+/* Cubic between stops k and k + 1: a broken line would show as contours at its stops. */
+static float between(const stop *ramp, const float *values, int k, int last, float t)
+{
+    float width = ramp[k + 1].at - ramp[k].at, x = (t - ramp[k].at) / width;
+    float a = tangent(ramp, values + k, k, last) * width, b = tangent(ramp, values + k + 1, k + 1, last) * width;
+    float rise = values[k + 1] - values[k];
+    return values[k] + x * (a + x * (3 * rise - 2 * a - b + x * (a + b - 2 * rise)));
+}
+
+static scene_rgb on_ramp(const stop *ramp, int stops, float t)
+{
+    float r[STOPS_MAX], g[STOPS_MAX], b[STOPS_MAX];
+    for (int k = 0; k < stops; k++) {
+        scene_rgb c = scene_rgb_of(ramp[k].hex);
+        r[k] = c.r;
+        g[k] = c.g;
+        b[k] = c.b;
+    }
+    t = t > 0 ? t < 1 ? t : 1 : 0;
+    int k = 0, last = stops - 1;
+    while (k + 1 < last && t > ramp[k + 1].at)
         k++;
-    float part = (t - ramp[k].at) / (ramp[k + 1].at - ramp[k].at);
-    return scene_mix(scene_rgb_of(ramp[k].hex), scene_rgb_of(ramp[k + 1].hex), part);
+    return (scene_rgb){between(ramp, r, k, last, t), between(ramp, g, k, last, t), between(ramp, b, k, last, t)};
 }
 
 static int by_height(const void *a, const void *b)
@@ -68,9 +89,9 @@ static size_t drop_voids(float *heights, size_t count)
 static scene_rgb colour_at(float height, float low, float high, bool with_sea)
 {
     if (with_sea && height < 0)
-        return on_ramp(sea, (height - low) / ((high < 0 ? high : 0) - low));
+        return on_ramp(sea, SEA, (height - low) / ((high < 0 ? high : 0) - low));
     float foot = with_sea ? 0 : low;
-    return on_ramp(land, high > foot ? (height - foot) / (high - foot) : 0.35f);
+    return on_ramp(land, LAND, high > foot ? (height - foot) / (high - foot) : 0.35f);
 }
 
 void scene_palette_init(scene_palette *palette, float *heights, size_t count, bool grey, bool sea_level)
@@ -89,7 +110,7 @@ void scene_palette_init(scene_palette *palette, float *heights, size_t count, bo
     palette->scale = range > 0 ? SCENE_PALETTE_STEPS / 2 / range : 0;
     for (int k = 0; k <= SCENE_PALETTE_STEPS; k++) {
         float height = low + range * 2 / SCENE_PALETTE_STEPS * (float)k;
-        palette->colours[k] = grey ? on_ramp(plain, 0) : colour_at(height, low, high, with_sea);
+        palette->colours[k] = grey ? scene_rgb_of(plain) : colour_at(height, low, high, with_sea);
     }
 }
 

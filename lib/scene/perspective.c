@@ -73,7 +73,8 @@ static bool tile_box(const scene *s, scene_tile_id id, scene_box *box)
     double reach = ldexp(fmax(s->ground.cell_x, s->ground.cell_y), id.step);
     box->low[2] = fmax(box->low[2] - reach, s->low);
     box->high[2] = fmin(box->high[2] + reach, s->high);
-    if (s->walls && (x0 == 0 || y0 == 0 || x1 == info->width - 1 || y1 == info->height - 1))
+    bool side = x0 == 0 || y0 == 0 || x1 == info->width - 1 || y1 == info->height - 1;
+    if (s->walls && (side || info->has_voids))
         box->low[2] = s->foot;
     return bounds.low <= bounds.high;
 }
@@ -377,16 +378,15 @@ static void draw_skirts(const scene *s, easel *e, scene_tile_id id, int columns,
 }
 
 /* A wall on the edge from vertex k on between two cells, if only one of them is drawn; `rim`: it is on the raster's
- * side, and so looks straight outwards. Rims of voids are stairs, whose every step would be lit another way: they look
- * nowhere.
- */
+ * side, and so looks straight outwards. Rims of voids are stairs, whose every step would be lit another way: all
+ * of them are taken to look south, as from where a model is seen. */
 static void draw_wall(const scene *s, easel *e, int k, bool along_row, bool rim)
 {
     int stride = along_row ? 1 : SCENE_GRID, before = k - (along_row ? SCENE_GRID : 1);
     bool here = missing_corner(e, k) >= 0;
     if (here == (missing_corner(e, before) >= 0))
         return;
-    curtain wall = {.wall = true};
+    curtain wall = {.wall = true, .north = rim ? 0 : -1};
     if (rim && along_row)
         wall.north = here ? 1 : -1;
     else if (rim)
@@ -410,7 +410,7 @@ static void draw_walls(const scene *s, easel *e, scene_tile_id id, int columns, 
             if (missing < 0 || missing == 4)
                 continue;
             const int at[4] = {k, k + 1, k + SCENE_GRID + 1, k + SCENE_GRID};
-            const curtain wall = {.wall = true};
+            const curtain wall = {.wall = true, .north = -1};
             draw_curtain(s, e, &wall, at[(missing + 1) & 3], at[(missing + 3) & 3]);
         }
 }
@@ -468,10 +468,8 @@ static scene_rgb fragment_colour(const scene *s, const scene_fragment *f, double
     scene_rgb colour;
     if (isnan(f->height)) {
         const scene_rgb stone = {0.50f, 0.47f, 0.44f};
-        const float steep = 1e3f, dim = 0.5f;
-        bool somewhere = f->east != 0 || f->north != 0;
-        colour = somewhere ? scene_lit(&s->light, stone, -f->east * steep, -f->north * steep, 1)
-                           : (scene_rgb){stone.r * dim, stone.g * dim, stone.b * dim};
+        const float steep = 1e3f;
+        colour = scene_lit(&s->light, stone, -f->east * steep, -f->north * steep, 1);
     } else {
         colour = scene_lit(&s->light, scene_palette_at(&s->palette, f->height), f->east, f->north, 1);
     }
