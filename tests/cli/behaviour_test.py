@@ -96,6 +96,19 @@ def pinned_heights(case):
         expect(found.get(name) == want.get(name), f"{name}: {found.get(name)}, pinned is {want.get(name)}")
 
 
+def previews_are_equal_for_any_threads(case):
+    write_dem(case, holes=True)
+    for options in ((), ("-p",), ("--grey", "--beside", EXAMPLE, "--width", 300)):
+        for dem in (EXAMPLE, "dem.tif"):
+            made = set()
+            for threads in (1, 2, 5):
+                if "--beside" in options:
+                    dem = EXAMPLE
+                case.run("preview", dem, *options, "--height", 200, "-t", threads, "-q", "--overwrite", "-o", "a.png")
+                made.add(sha256(case.path("a.png")))
+            expect(len(made) == 1, f"{dem} {options}: {len(made)} different pictures")
+
+
 # ---- nothing left behind ----
 
 def lines_then_signal(case, command, count, number, twice=False):
@@ -181,23 +194,23 @@ def command_for(name):
     return ("simplify", EXAMPLE, "-e", 5) if name in ("glb", "obj", "ply") else ("synth", EXAMPLE, "-l", 1)
 
 
-def full_sizes(case):
-    sizes = {}
-    for name in FORMATS:
-        case.run(*command_for(name), "-q", "-o", f"full.{name}")
-        sizes[name] = os.path.getsize(case.path(f"full.{name}"))
-    return sizes
+def writers(case):
+    """Command, output and its size, for each format."""
+    found = [(command_for(name), f"a.{name}") for name in FORMATS] + [(("preview", EXAMPLE), "look.png")]
+    for command, output in found:
+        case.run(*command, "-q", "-o", f"full.{output}")
+        yield command, output, os.path.getsize(case.path(f"full.{output}"))
 
 
 def tells_a_file_size_limit(case):
     """ulimit -f, whose signal must not kill the program; up to the last byte, where a buffer may hide the failure."""
-    for name, size in full_sizes(case).items():
+    for command, output, size in writers(case):
         for limit in (0, 1000, size // 2, size - 1):
-            result = case.run(*command_for(name), "-o", f"a.{name}", status=1,
+            result = case.run(*command, "-o", output, status=1,
                               preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)))
-            expect(result.err == f"talus: a.{name}: cannot write: File too large\n"
-                   or (name == "png" and result.err == "talus: a.json: cannot write: File too large\n"),
-                   f"limit {limit} of {size}: {result.err}")
+            # with a picture of heights comes a JSON file
+            expect(re.fullmatch(r"talus: (a|look)\.\w+: cannot write: File too large\n", result.err),
+                   f"{output}, limit {limit} of {size}: {result.err}")
 
 
 def mounted_run(case, size, *command):
@@ -217,12 +230,12 @@ def mounted_run(case, size, *command):
 
 
 def tells_a_full_disk(case):
-    for name, size in full_sizes(case).items():
+    for command, output, size in writers(case):
         for share in (0.05, 0.5, 0.97):
             pages = max(1, int(size * share) // 4096)
-            out, err = mounted_run(case, pages * 4096, *command_for(name), "-o", f"a.{name}")
-            expect(out == "status 1\n", f"{name} on {pages} pages: {out}{err}")
-            expect(re.fullmatch(r"talus: a\.\w+: cannot write: No space left on device\n", err), f"{name}: {err}")
+            out, err = mounted_run(case, pages * 4096, *command, "-o", output)
+            expect(out == "status 1\n", f"{output} on {pages} pages: {out}{err}")
+            expect(re.fullmatch(r"talus: (a|look)\.\w+: cannot write: No space left on device\n", err), f"{output}: {err}")
 
 
 def tells_an_unwritable_folder(case):
@@ -577,6 +590,46 @@ def simplify_keeps_its_word(case):
     expect(triangles == sorted(triangles, reverse=True), f"{triangles}")
 
 
+# ---- the manuals ----
+
+def commands_in_readme():
+    with open(os.path.join(ROOT, "README.md"), encoding="utf-8") as file:
+        text = file.read()
+    found = re.findall(r"`(talus [^`\n]+)`", text) + re.findall(r"^(talus [^#\n]+)", text, flags=re.M)
+    return [line.strip() for line in found if not re.search(r"[A-Z]{4}", line)]
+
+
+def commands_in_help(case):
+    found = re.findall(r"^Try: (talus .*)$", case.run("help").out, flags=re.M)
+    for name in ("info", "simplify", "synth", "preview", "noise"):
+        found += re.findall(r"^(?:Examples?:| +) (talus .*)$", case.run("help", name).out, flags=re.M)
+    return found
+
+
+def manuals_show_what_works(case):
+    """Every command line of the README and of the help texts, in a folder with the example as dem.tif."""
+    with open(EXAMPLE, "rb") as example, open(case.path("dem.tif"), "wb") as copy:
+        copy.write(example.read())
+    case.run("synth", "dem.tif", "-l", 1, "-q", "-o", "terrain.exr")
+    lines = commands_in_readme() + commands_in_help(case)
+    expect(len(lines) >= 9, f"{lines}")
+    for line in lines:
+        words = line.replace("--levels 4", "--levels 1").split()[1:]  # the same, in less time
+        if "-o" in words:
+            expect(case.start(*words, "-q", "--overwrite", stderr=subprocess.DEVNULL).wait(120) == 0, line)
+        else:
+            case.run(*words)
+
+
+def man_page_knows_every_option(case):
+    with open(os.path.join(ROOT, "doc", "talus.1.scd"), encoding="utf-8") as file:
+        page = file.read()
+    for name in ("info", "simplify", "synth", "preview", "noise"):
+        expect(f"*talus {name}*" in page and f"## {name}" in page, f"{name} is not in the man page")
+        for option in re.findall(r"^ +(?:-\w, )?--([\w-]+)", case.run("help", name).out, flags=re.M):
+            expect(f"--{option}*" in page, f"--{option} of {name} is not in the man page")
+
+
 # ---- memory ----
 
 def memory_does_not_grow_with_the_output(case):
@@ -702,7 +755,7 @@ TESTS = [
     *(equal_bytes(name, "synth", EXAMPLE, "--levels", 0) for name in ("glb", "obj", "ply")),
     *(equal_bytes(name, "noise", "--size", 300, "--seed", 9) for name in ("exr", "tif", "glb")),
     *(equal_bytes(name, "simplify", EXAMPLE, "-e", 3) for name in ("glb", "obj", "ply")),
-    pinned_heights,
+    pinned_heights, previews_are_equal_for_any_threads,
     *(interrupted(name, number) for name in ("exr", "tif", "png") for number in (signal.SIGINT, signal.SIGTERM)),
     leaves_nothing_when_interrupted_early, leaves_nothing_when_interrupted_twice,
     leaves_nothing_or_all_when_a_mesh_is_interrupted, leaves_nothing_when_killed, leaves_the_old_file_when_interrupted,
@@ -713,6 +766,7 @@ TESTS = [
     formats_hold_the_same_heights, png_within_half_a_step, point_samples_are_kept, point_samples_of_the_andes_are_kept,
     area_means_stay_on_their_footprint,
     glb_is_in_metres, frames_agree, simplify_keeps_its_word,
+    manuals_show_what_works, man_page_knows_every_option,
     memory_does_not_grow_with_the_output, bad_files_end_with_one_line,
     gdal_reads_the_geotiff, gdal_places_the_example, openexr_reads_the_exr, openimageio_agrees_on_the_range,
 ]

@@ -26,7 +26,7 @@ def prepare(case):
         example = file.read()
     contents = {"empty.tif": b"", "text.tif": b"this is no elevation model\n", "cut.tif": example[:len(example) // 2],
                 "exists.exr": b"precious", "exists.glb": b"precious", "exists.tif": b"precious",
-                "beside.json": b"precious"}
+                "exists.png": b"precious", "beside.json": b"precious"}
     for name, content in contents.items():
         with open(case.path(name), "wb") as file:
             file.write(content)
