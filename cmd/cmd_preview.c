@@ -24,7 +24,7 @@ static void place_sun(settings *set)
     if (!set->azimuth_given && set->elevation_given)
         set->preview.sun_azimuth = perspective ? 235 : 315;
     if (!set->elevation_given && set->azimuth_given)
-        set->preview.sun_elevation = perspective ? 40 : 45;
+        set->preview.sun_elevation = perspective ? 35 : 45;
 }
 
 static bool settings_ok(settings *set)
@@ -85,7 +85,7 @@ static int run(const command *self, int argc, const char **argv, bool help)
     const option light[] = {{"sun-azimuth", 0, OPTION_NUMBER, &set.preview.sun_azimuth, &set.azimuth_given, "DEG",
                              "clockwise from north, 0...360 (default: 315; 235 in perspective)", 0, 360, NULL},
                             {"sun-elevation", 0, OPTION_NUMBER, &set.preview.sun_elevation, &set.elevation_given, "DEG",
-                             "above the horizon, 1...90 (default: 45; 40 in perspective)", 1, 90, NULL},
+                             "above the horizon, 1...90 (default: 45; 35 in perspective)", 1, 90, NULL},
                             {"exaggeration", 0, OPTION_NUMBER, &set.preview.exaggeration, NULL, "X",
                              "factor on heights, 0.01...100 (default: 1)", 0.01, 100, NULL},
                             {0}};

@@ -657,7 +657,7 @@ static void wrongOptionsAreRefused(void **state)
     (void)state;
     made m = make(hills, 20, 20, 1);
     tl_preview_options same = {.perspective = true, .view_given = true, .eye = {1, 2, 3}, .target = {1, 2, 3}};
-    tl_preview_options nowhere = {.perspective = true, .view_given = true, .eye = {NAN, 2, 3}};
+    tl_preview_options nowhere = {.perspective = true, .view_given = true, .eye = {(double)NAN, 2, 3}};
     const tl_preview_options wrong[] = {
         same,
         nowhere,
@@ -666,7 +666,7 @@ static void wrongOptionsAreRefused(void **state)
         {.width = -1},
         {.height = 40000},
         {.sun_elevation = 91},
-        {.sun_azimuth = INFINITY},
+        {.sun_azimuth = (double)INFINITY},
         {.exaggeration = -1},
     };
     for (size_t k = 0; k < sizeof wrong / sizeof *wrong; k++) {

@@ -61,7 +61,8 @@ bool scene_camera_outline(const scene_camera *camera, const scene_box *box, scen
 {
     double wide = camera->width / 2, high = camera->height / 2;
     int behind = 31;
-    *o = (scene_outline){INFINITY, INFINITY, -INFINITY, -INFINITY, INFINITY};
+    const double far_away = (double)INFINITY;
+    *o = (scene_outline){far_away, far_away, -far_away, -far_away, far_away};
     for (int corner = 0; corner < 8; corner++) {
         double position[3], v[3];
         corner_of(box, corner, position);

@@ -13,8 +13,8 @@ typedef struct stop {
 
 /* Greens of valleys, dry slopes, rock, and pale summits: muted, so that the light carries the shape, and brighter with
  * every step, so that no colour looks like a ridge. */
-static const stop land[] = {{0.00f, 0x7d9a84}, {0.18f, 0x95ad8b}, {0.36f, 0xb3ba98}, {0.54f, 0xc9bf9f},
-                            {0.70f, 0xccb69a}, {0.84f, 0xccbcaa}, {0.94f, 0xdcd6ce}, {1.00f, 0xf1efeb}};
+static const stop land[] = {{0.00f, 0x849d80}, {0.18f, 0x9aaf89}, {0.36f, 0xb6bb97}, {0.54f, 0xcbbf9e},
+                            {0.70f, 0xcab294}, {0.84f, 0xc9b7a4}, {0.94f, 0xdcd6ce}, {1.00f, 0xf1efeb}};
 static const stop sea[] = {{0.00f, 0x1f3f6e}, {0.35f, 0x35669a}, {0.70f, 0x659bc0}, {1.00f, 0xb4d6dd}};
 enum { STOPS_MAX = 8, LAND = sizeof land / sizeof *land, SEA = sizeof sea / sizeof *sea };
 static const unsigned plain = 0xd9d8d5;

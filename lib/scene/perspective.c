@@ -652,7 +652,7 @@ static tl_status prepare(scene *s, const tl_preview_options *o, tl_error *error)
     s->ground.per_metre = SUPER / s->camera.focal / cell;
     /* by default from behind the shoulder of an eye in the south */
     bool given = o->sun_azimuth != 0 || o->sun_elevation != 0;
-    scene_light_init(&s->light, given ? o->sun_azimuth : 235, given ? o->sun_elevation : 40);
+    scene_light_init(&s->light, given ? o->sun_azimuth : 235, given ? o->sun_elevation : 35);
     scene_encode_prepare();
     return choose_colours(s, o, error);
 }

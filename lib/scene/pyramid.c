@@ -38,17 +38,40 @@ static float mean(const scene_lattice *fine, int64_t x, int columns, int64_t y, 
     return valid >= 0.5f ? sum / valid : NAN;
 }
 
+static float mean_at(const scene_lattice *fine, const scene_lattice *coarse, int64_t x, int64_t y)
+{
+    int64_t left, up;
+    int columns = parents(x, coarse->width, fine->width, &left), rows = parents(y, coarse->height, fine->height, &up);
+    return mean(fine, left, columns, up, rows);
+}
+
+/* Means around every second sample of the middle of three rows, if all are valid; NaN or infinite otherwise. */
+static void means_of_rows(const float *above, const float *row, const float *below, int64_t count, float *restrict out)
+{
+    for (int64_t i = 0; i < count; i++) {
+        int64_t k = 2 * i;
+        float corners = (above[k] + above[k + 2]) + (below[k] + below[k + 2]);
+        float sides = (above[k + 1] + below[k + 1]) + (row[k] + row[k + 2]);
+        out[i] = 0.0625f * corners + 0.125f * sides + 0.25f * row[k + 1];
+    }
+}
+
 /* Fills coarse->heights for its window; fine's window must hold all that it is made of. */
 static void coarsen(const scene_lattice *fine, scene_lattice *coarse)
 {
-    tl_window w = coarse->window;
-    for (int64_t y = 0; y < w.height; y++)
-        for (int64_t x = 0; x < w.width; x++) {
-            int64_t left, up;
-            int columns = parents(w.x + x, coarse->width, fine->width, &left);
-            int rows = parents(w.y + y, coarse->height, fine->height, &up);
-            coarse->heights[y * w.width + x] = mean(fine, left, columns, up, rows);
+    tl_window w = coarse->window, f = fine->window;
+    int64_t first = tl_int64_max(w.x, 1), last = tl_int64_min(w.x + w.width, coarse->width - 1); /* those inside */
+    for (int64_t y = w.y; y < w.y + w.height; y++) {
+        float *out = coarse->heights + (y - w.y) * w.width - w.x;
+        bool inside = y > 0 && y < coarse->height - 1 && first < last;
+        if (inside) {
+            const float *row = fine->heights + (2 * y - f.y) * f.width + (2 * first - 1 - f.x);
+            means_of_rows(row - f.width, row, row + f.width, last - first, out + first);
         }
+        for (int64_t x = w.x; x < w.x + w.width; x++)
+            if (!inside || x < first || x >= last || !isfinite(out[x]))
+                out[x] = mean_at(fine, coarse, x, y);
+    }
 }
 
 static void span_finer(int64_t *first, int64_t *count, int64_t fine)

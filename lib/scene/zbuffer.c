@@ -6,7 +6,7 @@
 
 enum {
     SUBPIXELS = 256,
-    GUARD = 1 << 20,  /* pixels around the block within which corners may lie: edge functions then stay below 2^58 */
+    GUARD = 1 << 20,  /* pixels around the block within which corners lie: edge functions then stay below 2^62 */
     CLIPPED_MAX = 10, /* corners of a triangle cut by five planes: each adds one at most */
 };
 
@@ -23,12 +23,21 @@ typedef struct spot {
     float nearness, height, east, north; /* the last three over w, so that they are linear on the screen */
 } spot;
 
+/* Corners lie within the guard but for what clipping lost to rounding, which can be all where coordinates are 1e30. */
+static int64_t snap(double pixels)
+{
+    double most = 2.0 * GUARD;
+    if (!(pixels > -most)) /* also NaN */
+        pixels = -most;
+    return (int64_t)floor((pixels < most ? pixels : most) * SUBPIXELS + 0.5);
+}
+
 static spot project(const scene_zbuffer *z, const scene_corner *c)
 {
     double nearness = 1 / c->w;
     spot s;
-    s.x = (int64_t)floor((c->x * nearness - z->left) * SUBPIXELS + 0.5);
-    s.y = (int64_t)floor((c->y * nearness - z->top) * SUBPIXELS + 0.5);
+    s.x = snap(c->x * nearness - z->left);
+    s.y = snap(c->y * nearness - z->top);
     s.nearness = (float)nearness;
     s.height = (float)((double)c->height * nearness);
     s.east = (float)((double)c->east * nearness);
