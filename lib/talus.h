@@ -352,7 +352,7 @@ typedef struct tl_preview_options {
     int width, height; /* pixels, at most 32768; 0: the source's own shape, at most 2048 on the longer side (hillshade),
                           1920 x 1080 (perspective) */
     double sun_azimuth, sun_elevation; /* degrees, clockwise from north and above the horizon (0 ... 90); both 0: 315
-                                          and 45 (hillshade), 235 and 40 (perspective) */
+                                          and 45 (hillshade), 235 and 35 (perspective) */
     double exaggeration;               /* factor on heights (and on the eye's and the target's), 0 ... 1e6; 0: 1 */
     bool grey;                         /* no hypsometric colours */
     bool perspective;                  /* look from `eye` to `target` instead of straight down */
