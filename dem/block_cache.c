@@ -4,7 +4,7 @@
 
 #include <pthread.h>
 
-enum { MAX_BUCKETS = 1 << 16 };
+enum { MAX_BUCKETS = 1 << 16, LOCKS = 64, KEY_BITS = 36 };
 
 struct dem_cached_block {
     uint64_t key;
@@ -19,6 +19,8 @@ struct dem_block_cache {
     pthread_mutex_t lock;
     size_t budget, bytes;
     dem_cached_block *oldest, *newest;
+    uint64_t ranges; /* of keys, given away */
+    pthread_mutex_t decoding[LOCKS];
     uint64_t mask; /* buckets - 1 */
     dem_cached_block *buckets[];
 };
@@ -34,6 +36,8 @@ dem_block_cache *dem_block_cache_create(size_t budget, uint64_t blocks)
     cache->budget = budget;
     cache->mask = count - 1;
     pthread_mutex_init(&cache->lock, NULL);
+    for (size_t i = 0; i < LOCKS; i++)
+        pthread_mutex_init(&cache->decoding[i], NULL);
     return cache;
 }
 
@@ -47,7 +51,34 @@ void dem_block_cache_destroy(dem_block_cache *cache)
         free(block);
     }
     pthread_mutex_destroy(&cache->lock);
+    for (size_t i = 0; i < LOCKS; i++)
+        pthread_mutex_destroy(&cache->decoding[i]);
     free(cache);
+}
+
+uint64_t dem_block_cache_keys(dem_block_cache *cache)
+{
+    pthread_mutex_lock(&cache->lock);
+    uint64_t range = cache->ranges++;
+    pthread_mutex_unlock(&cache->lock);
+    return range << KEY_BITS;
+}
+
+/* Keys of neighbouring blocks are consecutive, so their low bits spread well; an odd factor spreads rasters of few
+ * blocks. */
+static uint64_t spread(uint64_t key)
+{
+    return key + (key >> KEY_BITS) * 0x9e3779b1;
+}
+
+void dem_block_cache_lock(dem_block_cache *cache, uint64_t key)
+{
+    pthread_mutex_lock(&cache->decoding[spread(key) % LOCKS]);
+}
+
+void dem_block_cache_unlock(dem_block_cache *cache, uint64_t key)
+{
+    pthread_mutex_unlock(&cache->decoding[spread(key) % LOCKS]);
 }
 
 static void order_remove(dem_block_cache *cache, dem_cached_block *block)
@@ -64,10 +95,9 @@ static void order_append(dem_block_cache *cache, dem_cached_block *block)
     cache->newest = block;
 }
 
-/* Keys of neighbouring blocks are consecutive, so their low bits spread well. */
 static dem_cached_block **bucket_of(dem_block_cache *cache, uint64_t key)
 {
-    return &cache->buckets[key & cache->mask];
+    return &cache->buckets[spread(key) & cache->mask];
 }
 
 static dem_cached_block *find_and_pin(dem_block_cache *cache, uint64_t key)

@@ -7,6 +7,7 @@
 #include <math.h>
 #include <proj.h>
 #include <proj_experimental.h>
+#include <string.h>
 
 struct dem_projection {
     PJ_CONTEXT *context;
@@ -16,6 +17,32 @@ struct dem_projection {
 struct dem_local_frame {
     void *tangent;
 };
+
+/* ---- Comparison ---- */
+
+static bool equivalent_wkt(const char *a, const char *b)
+{
+    PJ_CONTEXT *context = proj_context_create();
+    if (!context)
+        return false;
+    proj_log_level(context, PJ_LOG_NONE);
+    proj_context_set_enable_network(context, 0);
+    PJ *first = proj_create(context, a), *second = proj_create(context, b);
+    /* the order of axes is no matter: ours is always x, y */
+    bool same = first && second &&
+                proj_is_equivalent_to_with_ctx(context, first, second, PJ_COMP_EQUIVALENT_EXCEPT_AXIS_ORDER_GEOGCRS);
+    proj_destroy(second);
+    proj_destroy(first);
+    proj_context_destroy(context);
+    return same;
+}
+
+bool dem_crs_equivalent(const tl_crs *a, const tl_crs *b)
+{
+    if (a == b || (a->epsg && a->epsg == b->epsg) || (*a->wkt && strcmp(a->wkt, b->wkt) == 0))
+        return true;
+    return !(a->epsg && b->epsg) && equivalent_wkt(a->wkt, b->wkt);
+}
 
 /* ---- Projections ---- */
 

@@ -15,6 +15,11 @@ tl_status dem_crs_from_tiff_scaled(struct tiff *tiff, const char *path, tl_crs *
  */
 tl_status dem_crs_from_text(const char *text, const char *path, tl_crs **out, tl_error *error);
 
+/* Whether two CRSs give the same places the same coordinates, by their codes or, where one has none, by PROJ's
+ * judgement.
+ */
+bool dem_crs_equivalent(const tl_crs *a, const tl_crs *b);
+
 /* From coordinates of a CRS to longitude (east of its own prime meridian) and latitude in degrees on its own datum.
  * Thread-safe as long as each thread has its own. */
 typedef struct dem_projection dem_projection;

@@ -2,31 +2,19 @@
  * whole. Chunks are numbered row by row of the raster: (block row * chunks a block + part) * blocks across + column. */
 #include "dem/tiff_blocks.h"
 
-#include "dem/block_cache.h"
 #include "dem/tiff_samples.h"
 #include "lib/base/error.h"
 #include "lib/base/size.h"
 
-#include <pthread.h>
 #include <string.h>
-
-/* Threads that want the same chunk wait for each other instead of decoding it twice; chunks whose numbers differ by a
- * multiple of this wait needlessly. */
-enum { DECODE_LOCKS = 64 };
-
-/* A large strip is decoded from its top, by one handle that remembers how far it is. */
-typedef struct strip_stream {
-    dem_tiff_handle *handle; /* NULL: not begun */
-    int64_t next_row;        /* of the raster */
-} strip_stream;
 
 struct dem_blocks {
     dem_tiff_file *file;
+    uint64_t directory;
     dem_layout layout;
     dem_block_cache *cache;
-    int64_t parts; /* chunks a block */
-    strip_stream stream;
-    pthread_mutex_t locks[DECODE_LOCKS];
+    uint64_t first_key; /* of chunk 0 in the cache */
+    int64_t parts;      /* chunks a block */
 };
 
 typedef struct chunk {
@@ -35,35 +23,31 @@ typedef struct chunk {
     int64_t first, rows; /* rows of the raster, within the block; rows beyond the raster's last are not among them */
 } chunk;
 
-dem_blocks *dem_blocks_create(dem_tiff_file *file, const dem_layout *layout, size_t cache_bytes, tl_error *error)
+dem_blocks *dem_blocks_create(dem_tiff_file *file, uint64_t directory, const dem_layout *layout, dem_block_cache *cache,
+                              tl_error *error)
 {
-    dem_blocks *blocks = calloc(1, sizeof *blocks);
-    int64_t parts = tl_div_up(layout->block_height, layout->chunk_rows);
-    if (blocks)
-        blocks->cache = dem_block_cache_create(cache_bytes, (uint64_t)(layout->across * layout->down * parts));
-    if (!blocks || !blocks->cache) {
-        free(blocks);
+    dem_blocks *blocks = malloc(sizeof *blocks);
+    if (!blocks) {
         tl_fail_memory(error, dem_tiff_file_path(file));
         return NULL;
     }
-    blocks->file = file;
-    blocks->layout = *layout;
-    blocks->parts = parts;
-    for (size_t i = 0; i < DECODE_LOCKS; i++)
-        pthread_mutex_init(&blocks->locks[i], NULL);
+    *blocks = (dem_blocks){.file = file,
+                           .directory = directory,
+                           .layout = *layout,
+                           .cache = cache,
+                           .first_key = dem_block_cache_keys(cache),
+                           .parts = tl_div_up(layout->block_height, layout->chunk_rows)};
     return blocks;
 }
 
 void dem_blocks_destroy(dem_blocks *blocks)
 {
-    if (!blocks)
-        return;
-    if (blocks->stream.handle)
-        dem_tiff_give_back(blocks->file, blocks->stream.handle);
-    dem_block_cache_destroy(blocks->cache);
-    for (size_t i = 0; i < DECODE_LOCKS; i++)
-        pthread_mutex_destroy(&blocks->locks[i]);
     free(blocks);
+}
+
+static uint64_t key_of(const dem_blocks *blocks, const chunk *self)
+{
+    return blocks->first_key + (uint64_t)self->index;
 }
 
 static chunk chunk_at(const dem_blocks *blocks, int64_t column, int64_t y)
@@ -171,25 +155,25 @@ static tl_status load_whole(dem_blocks *blocks, const chunk *self, dem_cached_bl
 {
     float *heights = NULL;
     dem_tiff_handle *handle;
-    tl_status status = dem_tiff_take(blocks->file, &handle, error);
+    tl_status status = dem_tiff_take(blocks->file, blocks->directory, &handle, error);
     if (status != TL_OK)
         return status;
     status = decode_whole(blocks, self, handle, &heights, error);
     dem_tiff_give_back(blocks->file, handle);
     if (status != TL_OK || !heights)
         return status;
-    *out = dem_block_cache_add(blocks->cache, (uint64_t)self->index, heights,
+    *out = dem_block_cache_add(blocks->cache, key_of(blocks, self), heights,
                                (size_t)(blocks->layout.block_width * self->rows));
     return *out ? TL_OK : tl_fail_memory(error, dem_tiff_file_path(blocks->file));
 }
 
-/* ---- Large strips ---- */
+/* ---- Large strips: decoded from the top, by one handle that remembers how far it is ---- */
 
 /* Decodes the rows of one chunk at the stream's place. */
-static tl_status decode_rows(dem_blocks *blocks, const chunk *self, char *row, float *heights, tl_error *error)
+static tl_status decode_rows(dem_blocks *blocks, const chunk *self, dem_tiff_handle *handle, char *row, float *heights,
+                             tl_error *error)
 {
     const dem_layout *layout = &blocks->layout;
-    dem_tiff_handle *handle = blocks->stream.handle;
     for (int64_t k = 0; k < self->rows; k++) {
         uint16_t plane = layout->separate ? (uint16_t)layout->band : 0;
         memset(row, 0, (size_t)layout->row_bytes);
@@ -200,7 +184,8 @@ static tl_status decode_rows(dem_blocks *blocks, const chunk *self, char *row, f
     return TL_OK;
 }
 
-static tl_status stream_chunk(dem_blocks *blocks, const chunk *self, dem_cached_block **out, tl_error *error)
+static tl_status stream_chunk(dem_blocks *blocks, const chunk *self, dem_tiff_handle *handle, dem_cached_block **out,
+                              tl_error *error)
 {
     const dem_layout *layout = &blocks->layout;
     tl_status status = TL_OK;
@@ -209,35 +194,31 @@ static tl_status stream_chunk(dem_blocks *blocks, const chunk *self, dem_cached_
     if (!heights || !row)
         status = tl_fail_memory(error, dem_tiff_file_path(blocks->file));
     else
-        status = decode_rows(blocks, self, row, heights, error);
+        status = decode_rows(blocks, self, handle, row, heights, error);
     free(row);
     if (status != TL_OK) {
         free(heights);
-        blocks->stream.next_row = INT64_MAX; /* wherever it stands: start again */
+        handle->next_row = INT64_MAX; /* wherever it stands: start again */
         return status;
     }
-    blocks->stream.next_row = self->first + self->rows;
-    *out = dem_block_cache_add(blocks->cache, (uint64_t)self->index, heights, (size_t)(layout->width * self->rows));
+    handle->next_row = self->first + self->rows;
+    *out = dem_block_cache_add(blocks->cache, key_of(blocks, self), heights, (size_t)(layout->width * self->rows));
     return *out ? TL_OK : tl_fail_memory(error, dem_tiff_file_path(blocks->file));
 }
 
 /* Every row above must be decoded first; what passes by goes into the cache, for it is likely to be wanted too. */
-static tl_status load_streamed(dem_blocks *blocks, const chunk *self, dem_cached_block **out, tl_error *error)
+static tl_status stream_to(dem_blocks *blocks, const chunk *self, dem_tiff_handle *handle, dem_cached_block **out,
+                           tl_error *error)
 {
-    strip_stream *stream = &blocks->stream;
     int64_t top = self->row * blocks->layout.block_height;
-    tl_status status = stream->handle ? TL_OK : dem_tiff_take(blocks->file, &stream->handle, error);
-    if (status != TL_OK)
-        return status;
-    dem_tiff_forget(stream->handle);
     bool sparse;
-    status = look_up_block(blocks, self, stream->handle, &sparse, error);
+    tl_status status = look_up_block(blocks, self, handle, &sparse, error);
     if (status != TL_OK || sparse)
         return status;
-    int64_t from = stream->next_row > top && stream->next_row <= self->first ? stream->next_row : top;
+    int64_t from = handle->next_row > top && handle->next_row <= self->first ? handle->next_row : top;
     for (int64_t y = from;;) {
         chunk at = chunk_at(blocks, 0, y);
-        status = stream_chunk(blocks, &at, out, error);
+        status = stream_chunk(blocks, &at, handle, out, error);
         if (status != TL_OK || at.index == self->index)
             return status;
         dem_block_cache_unpin(blocks->cache, *out);
@@ -245,23 +226,36 @@ static tl_status load_streamed(dem_blocks *blocks, const chunk *self, dem_cached
     }
 }
 
+static tl_status load_streamed(dem_blocks *blocks, const chunk *self, dem_cached_block **out, tl_error *error)
+{
+    dem_tiff_handle *handle;
+    tl_status status = dem_tiff_take_kept(blocks->file, blocks, &handle, error);
+    if (status == TL_OK && !handle)
+        status = dem_tiff_take(blocks->file, blocks->directory, &handle, error);
+    if (status != TL_OK)
+        return status;
+    status = stream_to(blocks, self, handle, out, error);
+    dem_tiff_keep(blocks->file, handle, blocks);
+    return status;
+}
+
 /* ---- Reading ---- */
 
 /* The chunk, pinned; NULL where the file leaves its block out. */
 static tl_status get_chunk(dem_blocks *blocks, const chunk *self, dem_cached_block **out, tl_error *error)
 {
-    uint64_t key = (uint64_t)self->index;
+    uint64_t key = key_of(blocks, self);
     *out = dem_block_cache_find(blocks->cache, key);
     if (*out)
         return TL_OK;
     bool streamed = blocks->parts > 1;
-    pthread_mutex_t *lock = &blocks->locks[streamed ? 0 : key % DECODE_LOCKS];
-    pthread_mutex_lock(lock);
+    uint64_t lock = streamed ? blocks->first_key : key;
+    dem_block_cache_lock(blocks->cache, lock);
     tl_status status = TL_OK;
     *out = dem_block_cache_find(blocks->cache, key);
     if (!*out)
         status = (streamed ? load_streamed : load_whole)(blocks, self, out, error);
-    pthread_mutex_unlock(lock);
+    dem_block_cache_unlock(blocks->cache, lock);
     return status;
 }
 

@@ -2,12 +2,15 @@
 #ifndef DEM_TIFF_BLOCKS_H
 #define DEM_TIFF_BLOCKS_H
 
+#include "dem/block_cache.h"
 #include "dem/tiff_layout.h"
 
 typedef struct dem_blocks dem_blocks;
 
-/* Borrows the file and copies the layout. NULL, described, when out of memory. */
-dem_blocks *dem_blocks_create(dem_tiff_file *file, const dem_layout *layout, size_t cache_bytes, tl_error *error);
+/* The image at the directory with this offset (0: the first). Borrows the file and the cache and copies the layout.
+ * NULL, described, when out of memory. */
+dem_blocks *dem_blocks_create(dem_tiff_file *file, uint64_t directory, const dem_layout *layout, dem_block_cache *cache,
+                              tl_error *error);
 /* Takes NULL. */
 void dem_blocks_destroy(dem_blocks *blocks);
 

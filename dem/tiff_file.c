@@ -3,13 +3,9 @@
 #include "lib/base/error.h"
 #include "lib/base/size.h"
 
-#include <errno.h>
-#include <fcntl.h>
 #include <pthread.h>
 #include <stdio.h>
 #include <string.h>
-#include <sys/stat.h>
-#include <unistd.h>
 
 enum {
     MAX_IDLE = 16,                   /* handles kept for the next reader */
@@ -19,12 +15,12 @@ enum {
 };
 
 struct dem_tiff_file {
-    char *path;
-    int descriptor;
+    dem_file *file;
+    const char *path; /* the file's */
     int64_t size;
     pthread_mutex_t lock; /* guards the list of idle handles */
     dem_tiff_handle *idle;
-    unsigned idle_count;
+    unsigned idle_count; /* of those that nobody keeps */
 };
 
 /* ---- libtiff's I/O and messages ---- */
@@ -32,18 +28,9 @@ struct dem_tiff_file {
 static tmsize_t read_bytes(thandle_t user, void *out, tmsize_t count)
 {
     dem_tiff_handle *handle = user;
-    tmsize_t done = 0;
-    while (done < count) {
-        ssize_t got =
-            pread(handle->file->descriptor, (char *)out + done, (size_t)(count - done), (off_t)handle->position);
-        if (got < 0 && errno == EINTR)
-            continue;
-        if (got <= 0)
-            break;
-        done += got;
-        handle->position += (uint64_t)got;
-    }
-    return done;
+    int64_t got = dem_file_read_at(handle->file->file, out, count, (int64_t)handle->position);
+    handle->position += got > 0 ? (uint64_t)got : 0;
+    return got > 0 ? got : 0;
 }
 
 static tmsize_t write_bytes(thandle_t user, void *bytes, tmsize_t count)
@@ -143,17 +130,28 @@ static TIFF *open_tiff(dem_tiff_handle *handle)
     return tiff;
 }
 
-static tl_status open_handle(const dem_tiff_file *file, dem_tiff_handle **out, tl_error *error)
+static void free_handle(dem_tiff_handle *handle)
+{
+    TIFFClose(handle->tiff);
+    free(handle->scratch);
+    free(handle);
+}
+
+static tl_status open_handle(const dem_tiff_file *file, uint64_t directory, dem_tiff_handle **out, tl_error *error)
 {
     dem_tiff_handle *handle = calloc(1, sizeof *handle);
     if (!handle)
         return tl_fail_memory(error, file->path);
     handle->file = file;
+    handle->directory = directory;
     handle->tiff = open_tiff(handle);
-    if (!handle->tiff) {
+    if (!handle->tiff || (directory && !TIFFSetSubDirectory(handle->tiff, directory))) {
         tl_fail(error, TL_ERROR_DATA, "%s: cannot read the TIFF directory (is the file complete?): %s", file->path,
                 dem_tiff_message(handle, "no reason given"));
-        free(handle);
+        if (handle->tiff)
+            free_handle(handle);
+        else
+            free(handle);
         return TL_ERROR_DATA;
     }
     dem_tiff_forget(handle);
@@ -161,11 +159,10 @@ static tl_status open_handle(const dem_tiff_file *file, dem_tiff_handle **out, t
     return TL_OK;
 }
 
-void dem_tiff_drop(dem_tiff_handle *handle)
+void dem_tiff_drop(dem_tiff_file *file, dem_tiff_handle *handle)
 {
-    TIFFClose(handle->tiff);
-    free(handle->scratch);
-    free(handle);
+    free_handle(handle);
+    dem_file_release(file->file);
 }
 
 void *dem_tiff_scratch(dem_tiff_handle *handle, size_t bytes)
@@ -178,20 +175,60 @@ void *dem_tiff_scratch(dem_tiff_handle *handle, size_t bytes)
     return handle->scratch;
 }
 
-tl_status dem_tiff_take(dem_tiff_file *file, dem_tiff_handle **out, tl_error *error)
+/* Takes an idle handle out of the list: one that `owner` keeps, or one at `directory` that nobody does. */
+static dem_tiff_handle *take_idle(dem_tiff_file *file, uint64_t directory, const void *owner)
 {
     pthread_mutex_lock(&file->lock);
-    dem_tiff_handle *handle = file->idle;
+    dem_tiff_handle **link = &file->idle;
+    while (*link && ((*link)->owner != owner || (!owner && (*link)->directory != directory)))
+        link = &(*link)->next;
+    dem_tiff_handle *handle = *link;
     if (handle) {
-        file->idle = handle->next;
-        file->idle_count--;
+        *link = handle->next;
+        file->idle_count -= !owner;
     }
     pthread_mutex_unlock(&file->lock);
-    if (!handle)
-        return open_handle(file, out, error);
-    dem_tiff_forget(handle);
-    *out = handle;
+    if (handle)
+        dem_tiff_forget(handle);
+    return handle;
+}
+
+tl_status dem_tiff_take(dem_tiff_file *file, uint64_t directory, dem_tiff_handle **out, tl_error *error)
+{
+    tl_status status = dem_file_acquire(file->file, error);
+    if (status != TL_OK)
+        return status;
+    *out = take_idle(file, directory, NULL);
+    if (!*out)
+        status = open_handle(file, directory, out, error);
+    if (status != TL_OK)
+        dem_file_release(file->file);
+    return status;
+}
+
+tl_status dem_tiff_take_kept(dem_tiff_file *file, const void *owner, dem_tiff_handle **out, tl_error *error)
+{
+    tl_status status = dem_file_acquire(file->file, error);
+    if (status != TL_OK)
+        return status;
+    *out = take_idle(file, 0, owner);
+    if (!*out)
+        dem_file_release(file->file);
     return TL_OK;
+}
+
+/* False where there are enough idle ones already. */
+static bool put_idle(dem_tiff_file *file, dem_tiff_handle *handle)
+{
+    pthread_mutex_lock(&file->lock);
+    bool keep = handle->owner || file->idle_count < MAX_IDLE;
+    if (keep) {
+        handle->next = file->idle;
+        file->idle = handle;
+        file->idle_count += !handle->owner;
+    }
+    pthread_mutex_unlock(&file->lock);
+    return keep;
 }
 
 void dem_tiff_give_back(dem_tiff_file *file, dem_tiff_handle *handle)
@@ -201,87 +238,65 @@ void dem_tiff_give_back(dem_tiff_file *file, dem_tiff_handle *handle)
         handle->scratch = NULL;
         handle->scratch_bytes = 0;
     }
+    if (!put_idle(file, handle))
+        free_handle(handle);
+    dem_file_release(file->file);
+}
+
+void dem_tiff_keep(dem_tiff_file *file, dem_tiff_handle *handle, const void *owner)
+{
+    handle->owner = owner;
+    dem_tiff_give_back(file, handle);
+}
+
+/* What the pool does when it closes the file: handles hold memory too. */
+static void drop_idle(void *user)
+{
+    dem_tiff_file *file = user;
     pthread_mutex_lock(&file->lock);
-    bool keep = file->idle_count < MAX_IDLE;
-    if (keep) {
-        handle->next = file->idle;
-        file->idle = handle;
-        file->idle_count++;
+    for (dem_tiff_handle *handle = file->idle, *next; handle; handle = next) {
+        next = handle->next;
+        free_handle(handle);
     }
+    file->idle = NULL;
+    file->idle_count = 0;
     pthread_mutex_unlock(&file->lock);
-    if (!keep)
-        dem_tiff_drop(handle);
 }
 
 /* ---- The file ---- */
 
-static tl_status check_signature(const dem_tiff_file *file, tl_error *error)
+bool dem_is_tiff(const unsigned char head[4])
 {
     static const unsigned char signatures[4][4] = {
         {'I', 'I', 42, 0}, {'M', 'M', 0, 42}, {'I', 'I', 43, 0}, {'M', 'M', 0, 43}};
-    unsigned char head[4];
-    if (file->size == 0)
-        return tl_fail(error, TL_ERROR_DATA, "%s: the file is empty", file->path);
-    ssize_t got;
-    do
-        got = pread(file->descriptor, head, sizeof head, 0);
-    while (got < 0 && errno == EINTR);
-    if (got < 0)
-        return tl_fail_system(error, file->path, "read", errno);
-    for (size_t i = 0; got == sizeof head && i < sizeof signatures / sizeof *signatures; i++)
-        if (memcmp(head, signatures[i], sizeof head) == 0)
-            return TL_OK;
-    return tl_fail(error, TL_ERROR_DATA, "%s: not a TIFF file", file->path);
+    for (size_t i = 0; i < sizeof signatures / sizeof *signatures; i++)
+        if (memcmp(head, signatures[i], sizeof signatures[i]) == 0)
+            return true;
+    return false;
 }
 
-static tl_status open_descriptor(dem_tiff_file *file, tl_error *error)
-{
-    struct stat status;
-    /* O_NONBLOCK: opening a named pipe without it waits for a writer */
-    file->descriptor = open(file->path, O_RDONLY | O_CLOEXEC | O_NONBLOCK);
-    if (file->descriptor < 0)
-        return tl_fail_system(error, file->path, "open", errno);
-    if (fstat(file->descriptor, &status) != 0)
-        return tl_fail_system(error, file->path, "examine", errno);
-    if (S_ISDIR(status.st_mode))
-        return tl_fail(error, TL_ERROR_DATA, "%s: is a directory; name a GeoTIFF file in it", file->path);
-    if (!S_ISREG(status.st_mode))
-        return tl_fail(error, TL_ERROR_DATA, "%s: not a regular file; copy its content to one", file->path);
-    file->size = status.st_size;
-    return check_signature(file, error);
-}
-
-dem_tiff_file *dem_tiff_file_open(const char *path, tl_error *error)
+dem_tiff_file *dem_tiff_file_create(dem_file *base, tl_error *error)
 {
     dem_tiff_file *file = calloc(1, sizeof *file);
-    char *copy = file ? strdup(path) : NULL;
-    if (!copy) {
-        free(file);
-        tl_fail_memory(error, path);
+    if (!file) {
+        tl_fail_memory(error, dem_file_path(base));
         return NULL;
     }
-    file->path = copy;
-    file->descriptor = -1;
+    file->file = base;
+    file->path = dem_file_path(base);
+    file->size = dem_file_size(base);
     pthread_mutex_init(&file->lock, NULL);
-    if (open_descriptor(file, error) != TL_OK) {
-        dem_tiff_file_close(file);
-        return NULL;
-    }
+    dem_file_when_closed(base, drop_idle, file);
     return file;
 }
 
-void dem_tiff_file_close(dem_tiff_file *file)
+void dem_tiff_file_destroy(dem_tiff_file *file)
 {
     if (!file)
         return;
-    for (dem_tiff_handle *handle = file->idle, *next; handle; handle = next) {
-        next = handle->next;
-        dem_tiff_drop(handle);
-    }
-    if (file->descriptor >= 0)
-        close(file->descriptor);
+    dem_file_when_closed(file->file, NULL, NULL);
+    drop_idle(file);
     pthread_mutex_destroy(&file->lock);
-    free(file->path);
     free(file);
 }
 

@@ -3,16 +3,19 @@
 #ifndef DEM_TIFF_FILE_H
 #define DEM_TIFF_FILE_H
 
-#include "lib/talus.h"
+#include "dem/file_pool.h"
 
 #include <tiffio.h>
 
 typedef struct dem_tiff_file dem_tiff_file;
 
-/* A libtiff handle at the file's first directory. One thread at a time uses it. */
+/* A libtiff handle at one of the file's directories. One thread at a time uses it. */
 typedef struct dem_tiff_handle {
     TIFF *tiff;
     const dem_tiff_file *file;
+    uint64_t directory; /* offset of its directory, 0: the first */
+    const void *owner;  /* see dem_tiff_keep */
+    int64_t next_row;   /* for its owner; 0 at first */
     uint64_t position;
     char message[200]; /* libtiff's first complaint since dem_tiff_forget */
     void *scratch;     /* see dem_tiff_scratch */
@@ -20,20 +23,27 @@ typedef struct dem_tiff_handle {
     struct dem_tiff_handle *next;
 } dem_tiff_handle;
 
-/* Opens `path`, which must be a regular file that begins as TIFF files do. */
-dem_tiff_file *dem_tiff_file_open(const char *path, tl_error *error);
+/* Whether the first bytes of a file are those of a TIFF. */
+bool dem_is_tiff(const unsigned char head[4]);
+
+/* Borrows `file`. */
+dem_tiff_file *dem_tiff_file_create(dem_file *file, tl_error *error);
 /* All handles must be back. Takes NULL. */
-void dem_tiff_file_close(dem_tiff_file *file);
+void dem_tiff_file_destroy(dem_tiff_file *file);
 const char *dem_tiff_file_path(const dem_tiff_file *file);
 /* Size in bytes when it was opened. */
 int64_t dem_tiff_file_size(const dem_tiff_file *file);
 
-/* A handle for this thread until dem_tiff_give_back. */
-tl_status dem_tiff_take(dem_tiff_file *file, dem_tiff_handle **out, tl_error *error);
+/* A handle for this thread until dem_tiff_give_back, at the directory with this offset (0: the first). */
+tl_status dem_tiff_take(dem_tiff_file *file, uint64_t directory, dem_tiff_handle **out, tl_error *error);
 void dem_tiff_give_back(dem_tiff_file *file, dem_tiff_handle *handle);
+/* Gives a handle back for the owner's next dem_tiff_take_kept alone, standing where it stands. */
+void dem_tiff_keep(dem_tiff_file *file, dem_tiff_handle *handle, const void *owner);
+/* The handle that was kept; *out is NULL where there is none, or no longer. */
+tl_status dem_tiff_take_kept(dem_tiff_file *file, const void *owner, dem_tiff_handle **out, tl_error *error);
 
 /* Closes a handle instead of giving it back. */
-void dem_tiff_drop(dem_tiff_handle *handle);
+void dem_tiff_drop(dem_tiff_file *file, dem_tiff_handle *handle);
 
 /* Memory for the handle's user, of undefined content, until the next call; NULL when out of memory. */
 void *dem_tiff_scratch(dem_tiff_handle *handle, size_t bytes);

@@ -15,7 +15,7 @@ enum {
     MAX_BLOCK_BYTES = 1 << 30,     /* decoded; no writer of rasters makes such blocks on purpose */
     STREAM_ABOVE_BYTES = 32 << 20, /* heights of a strip that is not kept whole */
     CHUNK_BYTES = 4 << 20,         /* heights of a part of such a strip */
-    MAX_OVERVIEWS = 64,
+    MAX_DIRECTORIES = 64,
 };
 
 /* expansion: deflate's longest match is 258 bytes in 2 bits, PackBits repeats 128 times for 2 bytes, LZW's longest
@@ -295,12 +295,40 @@ tl_status dem_layout_read(dem_tiff_handle *handle, unsigned band, dem_layout *ou
     return status;
 }
 
-unsigned dem_overview_count(dem_tiff_handle *handle)
+/* The number of halvings k for which `size` is exactly 2^k of `reduced`; 0 where there is none. A copy whose size was
+ * rounded does not count: its samples are not quite 2^k of the image's apart, so the last ones would lie elsewhere. */
+static int halvings_of(int64_t size, int64_t reduced)
+{
+    for (int k = 1; k < 32 && reduced << k <= size; k++)
+        if (reduced << k == size)
+            return k;
+    return 0;
+}
+
+static bool use_overview(dem_tiff_handle *handle, const dem_layout *main, dem_overview *out)
+{
+    if (dem_layout_read(handle, main->band + 1, &out->layout, NULL) != TL_OK)
+        return false;
+    out->halvings = halvings_of(main->width, out->layout.width);
+    out->directory = TIFFCurrentDirOffset(handle->tiff);
+    /* what its numbers mean is told once, in the image's own directory */
+    bool same_numbers = out->layout.kind == main->kind && out->layout.bits == main->bits;
+    out->layout.has_nodata = main->has_nodata;
+    out->layout.nodata = main->nodata;
+    out->layout.rule = main->rule;
+    return same_numbers && out->halvings && halvings_of(main->height, out->layout.height) == out->halvings;
+}
+
+unsigned dem_overviews_read(dem_tiff_handle *handle, const dem_layout *main, dem_overview *out, unsigned *usable)
 {
     unsigned count = 0;
-    for (unsigned i = 0; i < MAX_OVERVIEWS && TIFFReadDirectory(handle->tiff); i++) {
+    *usable = 0;
+    for (unsigned i = 0; i < MAX_DIRECTORIES && TIFFReadDirectory(handle->tiff); i++) {
         uint32_t kind = long_tag(handle->tiff, TIFFTAG_SUBFILETYPE, 0);
-        count += (kind & FILETYPE_REDUCEDIMAGE) && !(kind & FILETYPE_MASK);
+        if (!(kind & FILETYPE_REDUCEDIMAGE) || (kind & FILETYPE_MASK))
+            continue;
+        count++;
+        *usable += *usable < DEM_MAX_OVERVIEWS && use_overview(handle, main, &out[*usable]);
     }
     return count;
 }

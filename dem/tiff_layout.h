@@ -38,8 +38,19 @@ typedef struct dem_layout {
  * image is a colour picture. */
 tl_status dem_layout_read(dem_tiff_handle *handle, unsigned band, dem_layout *out, tl_error *error);
 
-/* Reduced copies in the directories behind the handle's. The handle moves on: close it, do not read blocks with it. */
-unsigned dem_overview_count(dem_tiff_handle *handle);
+/* A reduced copy of the image, each of its samples standing for exactly 2^halvings of the image's either way. */
+typedef struct dem_overview {
+    int halvings;
+    uint64_t directory; /* its offset */
+    dem_layout layout;
+} dem_overview;
+
+enum { DEM_MAX_OVERVIEWS = 32 };
+
+/* Looks through the directories behind the handle's for reduced copies of the image `main`. Gives how many there are;
+ * those that can stand for a level go to out[DEM_MAX_OVERVIEWS], and their number to *usable. The handle moves on:
+ * close it, do not read blocks with it. */
+unsigned dem_overviews_read(dem_tiff_handle *handle, const dem_layout *main, dem_overview *out, unsigned *usable);
 
 /* Short name of a TIFF compression scheme, as "deflate"; "unknown" for others. */
 const char *dem_codec_name(uint16_t codec);

@@ -149,19 +149,57 @@ TL_API void tl_source_destroy(tl_source *source);
  * all that `info` points to). info->level must be 0. */
 TL_API tl_source *tl_array_source_create(const float *heights, const tl_source_info *info, tl_error *error);
 
-/* Opens a raster that talus can read, by its content: GeoTIFF, or an EXR heightfield that talus wrote. */
+/* Opens a raster that talus can read: an EXR heightfield that talus wrote, by its content, or whatever tl_dem_open
+ * takes.
+ */
 TL_API tl_source *tl_open(const char *path, tl_error *error);
 
 /* ---- Elevation models -------------------------------------------------------------------------- */
 
 typedef struct tl_dem_options {
     unsigned band; /* counted from 1; 0: the first */
+    /* Where files overlap, blend them over at most 32 samples from the rim of the one that comes first. false: the
+     * first that has a height gives it. */
+    bool feather;
+    /* Make every coarser level from full resolution. false: take the reduced copies that a file of area samples holds
+     * where they are smaller by exactly a power of two; how they were made is not known, so they may not be means. */
+    bool exact_levels;
+    unsigned open_files; /* of a mosaic, at a time, beside those that are being read; 0: 64 */
+    const tl_run *run;   /* for opening several files */
 } tl_dem_options;
 
-/* Opens the GeoTIFF `path`. Nothing but its directory is read yet. */
-TL_API tl_source *tl_dem_open(const char *path, const tl_dem_options *options, tl_error *error);
+/* Opens elevation models. Each of the `count` paths (at least one) is a GeoTIFF; an SRTM file named by its
+ * south-western corner, as N48W125.hgt; a directory, for the .tif, .tiff and .hgt files in it; a pattern with *, ? or [
+ * for files' names; or @LIST, a text file with one name a line, relative to its own folder, where # begins a comment.
+ * Nothing but the files' headers is read yet.
+ *
+ * Several files become one source. They must be in the same CRS, and not rotated in it. Its lattice, raster type and
+ * CRS are those of the file with the smallest cells (of equal ones, the first), its extent holds all files, and what no
+ * file covers is void. Where files overlap, the one with the smallest cells gives the height, then one on the mosaic's
+ * lattice, then the first; where that is void, the next. Samples of files on the mosaic's lattice (to a thousandth of a
+ * cell) are copied; others are interpolated, bilinearly, where all samples that count are known. Longitudes are shifted
+ * by whole turns so that the extent is as narrow as can be: tiles on both sides of the antimeridian lie beside each
+ * other. `quantum` is the smallest of the files' where all are multiples of it, else, and where heights are
+ * interpolated or feathered, 0. */
+TL_API tl_source *tl_dem_open(const char *const *paths, size_t count, const tl_dem_options *options, tl_error *error);
 
-/* What a GeoTIFF says of itself; strings live as long as the source. */
+/* Sources that tl_dem_open made hold coarser levels, down to a single sample. Level -k of a point raster has the
+ * samples whose column and row are multiples of 2^k, that of an area raster the means of the valid samples of 2^k x 2^k
+ * cells, fewer at the right and lower rim: ceil(size / 2^k) in either case. */
+
+/* One of the files of an elevation model. */
+typedef struct tl_dem_member {
+    const tl_source *source; /* the file alone; it belongs to the model. tl_dem_get_details takes it */
+    tl_window window;        /* the model's samples between its outermost ones */
+    bool resampled;          /* it lies on another lattice than the model, so its heights are interpolated */
+} tl_dem_member;
+
+/* How many files a source that tl_dem_open made reads; 0 for other sources. */
+TL_API size_t tl_dem_member_count(const tl_source *dem);
+/* Files in the order in which they were given. */
+TL_API tl_status tl_dem_get_member(const tl_source *dem, size_t index, tl_dem_member *out, tl_error *error);
+
+/* What a file says of itself; strings live as long as the source. */
 typedef struct tl_dem_details {
     const char *sample_type; /* "int16", "float32", ... */
     const char *codec;       /* "deflate", "lzw", "none", ... */
@@ -176,7 +214,7 @@ typedef struct tl_dem_details {
     int64_t bytes;        /* size of the file */
 } tl_dem_details;
 
-/* Details of a source that tl_dem_open made; TL_ERROR_ARGUMENT for any other. */
+/* Details of a source that tl_dem_open made of one file; TL_ERROR_ARGUMENT for any other. */
 TL_API tl_status tl_dem_get_details(const tl_source *dem, tl_dem_details *out, tl_error *error);
 
 /* Range and void share of a source's finest level, read once from end to end. */

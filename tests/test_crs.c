@@ -55,7 +55,7 @@ static tl_source *open_with(const uint16_t *keys, unsigned count, const double *
                                                      .key_ascii = ascii,
                                                      .scale = scale,
                                                      .ties = tie}));
-    tl_source *source = tl_dem_open(path, NULL, NULL);
+    tl_source *source = tl_dem_open((const char *const[]){path}, 1, NULL, NULL);
     assert_non_null(source);
     return source;
 }

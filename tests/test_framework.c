@@ -806,7 +806,7 @@ static tl_source *open_shared(const char *name)
         snprintf(path, sizeof path, "%s/dem/%s", shared, name);
     else
         snprintf(path, sizeof path, "%s/../shared/data/dem/%s", root ? root : ".", name);
-    return tl_dem_open(path, NULL, NULL);
+    return tl_dem_open((const char *const[]){path}, 1, NULL, NULL);
 }
 
 /* The exact and saturated triangulation of the first 1025 x 1025 samples at 20 m, as independent prototypes had it. */

@@ -34,7 +34,7 @@ static bool same_float(float a, float b)
 static tl_source *open_band(unsigned band)
 {
     tl_error error = {0};
-    tl_source *source = tl_dem_open(path, &(tl_dem_options){.band = band}, &error);
+    tl_source *source = tl_dem_open((const char *const[]){path}, 1, &(tl_dem_options){.band = band}, &error);
     if (!source)
         print_error("%s\n", error.text);
     assert_non_null(source);
@@ -613,7 +613,7 @@ static void write_file(const char *content, size_t bytes)
 static void expect_refusal(const char *name, unsigned band, tl_status status, const char *part)
 {
     tl_error error = {0};
-    tl_source *source = tl_dem_open(name, &(tl_dem_options){.band = band}, &error);
+    tl_source *source = tl_dem_open(&name, 1, &(tl_dem_options){.band = band}, &error);
     assert_null(source);
     assert_int_equal(error.status, status);
     if (strncmp(error.text, name, strlen(name)) != 0 || !strstr(error.text, part) || strchr(error.text, '\n'))
@@ -625,8 +625,11 @@ static void refusalsSayWhy(void **state)
     (void)state;
     char missing[112];
     snprintf(missing, sizeof missing, "%s-missing", path);
-    expect_refusal(missing, 0, TL_ERROR_IO, "cannot open");
-    expect_refusal(folder, 0, TL_ERROR_DATA, "directory");
+    expect_refusal(missing, 0, TL_ERROR_IO, "cannot read");
+    snprintf(missing, sizeof missing, "%s/empty", folder);
+    assert_int_equal(mkdir(missing, 0700), 0);
+    expect_refusal(missing, 0, TL_ERROR_DATA, "in this directory");
+    rmdir(missing);
     expect_refusal("/dev/null", 0, TL_ERROR_DATA, "regular file");
     write_file("", 0);
     expect_refusal(path, 0, TL_ERROR_DATA, "empty");
@@ -653,7 +656,7 @@ static void refusalsSayWhy(void **state)
 static bool survives(const make_tiff_options *must_equal)
 {
     tl_error error = {0};
-    tl_source *source = tl_dem_open(path, &(tl_dem_options){.band = 1}, &error);
+    tl_source *source = tl_dem_open((const char *const[]){path}, 1, &(tl_dem_options){.band = 1}, &error);
     tl_status status = source ? TL_OK : error.status;
     if (source && source->info.width * source->info.height <= 1 << 20) {
         size_t count = (size_t)(source->info.width * source->info.height);
@@ -778,7 +781,7 @@ static void realFileHasItsKnownRange(void **state)
         snprintf(name, sizeof name, "%s/../shared/data/dem/nfong_S33W071.tif", root ? root : ".");
     if (access(name, R_OK) != 0)
         skip();
-    tl_source *source = tl_dem_open(name, NULL, NULL);
+    tl_source *source = tl_dem_open((const char *const[]){name}, 1, NULL, NULL);
     assert_non_null(source);
     tl_range range;
     assert_int_equal(tl_source_range(source, NULL, &range, NULL), TL_OK);

@@ -3,7 +3,6 @@
 #include "lib/scene/north_up.h"
 
 #include <assert.h>
-#include <errno.h>
 #include <fcntl.h>
 #include <string.h>
 #include <strings.h>
@@ -134,18 +133,20 @@ tl_status tl_write_grid(const tl_source *source, const char *path, const tl_writ
     return status;
 }
 
+static bool is_exr(const char *path)
+{
+    static const unsigned char magic[4] = {0x76, 0x2f, 0x31, 0x01};
+    unsigned char head[4] = {0};
+    /* O_NONBLOCK: opening a named pipe without it waits for a writer */
+    int descriptor = open(path, O_RDONLY | O_CLOEXEC | O_NONBLOCK);
+    if (descriptor < 0)
+        return false;
+    ssize_t count = pread(descriptor, head, sizeof head, 0);
+    close(descriptor);
+    return count == (ssize_t)sizeof head && memcmp(head, magic, sizeof head) == 0;
+}
+
 tl_source *tl_open(const char *path, tl_error *error)
 {
-    static const unsigned char exr_magic[4] = {0x76, 0x2f, 0x31, 0x01};
-    unsigned char head[4] = {0};
-    int descriptor = open(path, O_RDONLY | O_CLOEXEC);
-    if (descriptor < 0) {
-        tl_fail_system(error, path, "read", errno);
-        return NULL;
-    }
-    ssize_t count = read(descriptor, head, sizeof head);
-    close(descriptor);
-    if (count == (ssize_t)sizeof head && memcmp(head, exr_magic, sizeof head) == 0)
-        return out_exr_open(path, error);
-    return tl_dem_open(path, NULL, error);
+    return is_exr(path) ? out_exr_open(path, error) : tl_dem_open(&path, 1, NULL, error);
 }
