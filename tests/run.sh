@@ -11,7 +11,6 @@ builds=${1:-$here/build-tests}
 mkdir -p "$builds"
 TALUS_SOURCE_ROOT=$here
 export TALUS_SOURCE_ROOT
-failed=0
 
 setup() { # FOLDER OPTION...
     folder=$1
@@ -25,7 +24,8 @@ suite() { # NAME OPTION...: builds and runs all tests; their results are in the 
     setup "$builds/$name" --werror "$@"
     ninja -C "$builds/$name" --quiet
     echo "== $name"
-    meson test -C "$builds/$name" --no-rebuild --num-processes 2 --timeout-multiplier 4 --print-errorlogs || failed=1
+    meson test -C "$builds/$name" --no-rebuild --num-processes 2 --timeout-multiplier 4 --print-errorlogs ||
+        : # summary.py counts what failed
 }
 
 suite release
