@@ -24,6 +24,7 @@ suite() { # NAME OPTION...: builds and runs all tests; their results are in the 
     setup "$builds/$name" --werror "$@"
     ninja -C "$builds/$name" --quiet
     echo "== $name"
+    rm -f "$builds/$name/meson-logs/testlog.json" # of an earlier run
     meson test -C "$builds/$name" --no-rebuild --num-processes 2 --timeout-multiplier 4 --print-errorlogs ||
         : # summary.py counts what failed
 }

@@ -5,6 +5,7 @@ Reads meson's log of each build folder. A test program that prints cmocka's repo
 Prints what failed and, last, "N passed, N failed"; exits 1 when something failed or nothing passed.
 """
 import json
+import os
 import re
 import sys
 
@@ -41,7 +42,12 @@ def main():
             if result != "ok":
                 print(f"failed: {name}")
             continue
-        with open(f"{argument}/meson-logs/testlog.json", encoding="utf-8") as log:
+        path = f"{argument}/meson-logs/testlog.json"
+        if not os.path.exists(path):
+            failed += 1
+            print(f"failed: {argument}: no test was run")
+            continue
+        with open(path, encoding="utf-8") as log:
             for line in log:
                 test = json.loads(line)
                 p, f, s = one(test)
