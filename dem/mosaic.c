@@ -223,7 +223,7 @@ static between split(double position)
         return (between){i, i, 0};
     if (part > 1 - rounding)
         return (between){i + 1, i + 1, 0};
-    return part < 0.5 ? (between){i, i + 1, part} : (between){i + 1, i, 1 - part};
+    return part < 0.5 - rounding ? (between){i, i + 1, part} : (between){i + 1, i, 1 - part};
 }
 
 /* A block of the layer's lattice, and which of its samples a member covers. */

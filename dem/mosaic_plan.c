@@ -292,19 +292,21 @@ static tl_window union_of(const dem_layer *layer)
     return (tl_window){x0, y0, x1 - x0, y1 - y0};
 }
 
-/* The mosaic's columns, or rows, that `count` of a layer from `first` on can give: those between the outer samples of
- * points, both included, and those within the outer cells of areas. False where they are too far away. */
+/* The mosaic's columns, or rows, that `count` of a layer from `first` on can give: those from the first sample of
+ * points to the last; those within the cells of areas, where a cell has its lower edge but not its upper one. False
+ * where they are too far away. */
 static bool covered(double from0, double step, double own0, double own_step, int64_t first, int64_t count, bool area,
                     int64_t *begin, int64_t *size)
 {
     double margin = area ? 0.5 : 0;
-    double a = (from0 + step * ((double)first - margin) - own0) / own_step;
-    double b = (from0 + step * ((double)(first + count - 1) + margin) - own0) / own_step;
-    double low = fmin(a, b), high = fmax(a, b);
+    double low = (from0 + step * ((double)first - margin) - own0) / own_step;
+    double high = (from0 + step * ((double)(first + count - 1) + margin) - own0) / own_step;
     if (!(fabs(low) < farthest && fabs(high) < farthest))
         return false;
-    *begin = area ? (int64_t)floor(low + rounding) + 1 : (int64_t)ceil(low - rounding);
-    *size = (area ? (int64_t)ceil(high - rounding) : (int64_t)floor(high + rounding) + 1) - *begin;
+    bool rising = low <= high;
+    double from = fmin(low, high), to = fmax(low, high);
+    *begin = area && !rising ? (int64_t)floor(from + rounding) + 1 : (int64_t)ceil(from - rounding);
+    *size = (area && rising ? (int64_t)ceil(to - rounding) : (int64_t)floor(to + rounding) + 1) - *begin;
     return true;
 }
 

@@ -85,6 +85,15 @@ static bool is_raster_name(const char *name)
     return false;
 }
 
+/* Adds the entry of a directory; one that is a directory itself is left out again. */
+static tl_status add_entry(dem_paths *paths, const char *path, const char *name, tl_error *error)
+{
+    tl_status status = add(paths, path, strlen(path), name, error);
+    if (status == TL_OK && is_directory(paths->names[paths->count - 1]))
+        free(paths->names[--paths->count]);
+    return status;
+}
+
 static tl_status add_entries(dem_paths *paths, const char *path, DIR *directory, tl_error *error)
 {
     tl_status status = TL_OK;
@@ -92,7 +101,7 @@ static tl_status add_entries(dem_paths *paths, const char *path, DIR *directory,
     errno = 0;
     while (status == TL_OK && (entry = readdir(directory)) != NULL) {
         if (is_raster_name(entry->d_name))
-            status = add(paths, path, strlen(path), entry->d_name, error);
+            status = add_entry(paths, path, entry->d_name, error);
         errno = 0;
     }
     return status == TL_OK && errno ? tl_fail_system(error, path, "read", errno) : status;
