@@ -120,11 +120,19 @@ typedef struct tl_source_info {
     tl_raster_type type;
     tl_georef georef; /* of the samples of level `level` */
     bool has_voids;   /* false: certainly no NaN; true: NaN may occur */
+    bool wraps;       /* its columns go once around the globe: behind the last one comes column 0 again */
     double quantum; /* step between representable heights (1 for an integer DEM without scale), 0 for continuous ones */
     const char *name;               /* what to call it in messages: the file, mostly; never NULL */
     const tl_parameter *parameters; /* how it was made; NULL when parameter_count is 0 */
     size_t parameter_count;
 } tl_source_info;
+
+/* What is known of a sample. */
+typedef enum tl_validity {
+    TL_VOID = 0,       /* nothing: the height is NaN */
+    TL_FILLED = 1,     /* made up, as by tl_voids_create */
+    TL_MEASURED = 255, /* in the data, or refined from such samples */
+} tl_validity;
 
 /* A grid of heights. Make your own by filling in this struct: it is the whole contract. */
 typedef struct tl_source tl_source;
@@ -136,6 +144,9 @@ struct tl_source {
     tl_status (*read)(const tl_source *self, int level, tl_window window, float *out, tl_error *error);
     /* Size at a coarser level than info.level; NULL: only info.level is held. */
     tl_status (*size)(const tl_source *self, int level, int64_t *width, int64_t *height, tl_error *error);
+    /* Writes a tl_validity for each sample of the window, likewise. NULL: void where the height is NaN, else measured.
+     */
+    tl_status (*validity)(const tl_source *self, int level, tl_window window, unsigned char *out, tl_error *error);
     void (*destroy)(tl_source *self); /* NULL: nothing to free */
 };
 
@@ -143,6 +154,9 @@ struct tl_source {
 TL_API tl_status tl_source_size(const tl_source *source, int level, int64_t *width, int64_t *height, tl_error *error);
 /* Reads a window, which must lie inside of the grid of that level. */
 TL_API tl_status tl_source_read(const tl_source *source, int level, tl_window window, float *out, tl_error *error);
+/* The validity of the samples of a window. */
+TL_API tl_status tl_source_validity(const tl_source *source, int level, tl_window window, unsigned char *out,
+                                    tl_error *error);
 TL_API void tl_source_destroy(tl_source *source);
 
 /* A source over the caller's array of info->width * info->height heights, which must outlive it (as must
@@ -225,6 +239,25 @@ typedef struct tl_range {
 } tl_range;
 
 TL_API tl_status tl_source_range(const tl_source *source, const tl_run *run, tl_range *out, tl_error *error);
+
+/* ---- Voids -------------------------------------------------------------------------------------- */
+
+typedef enum tl_void_rule {
+    TL_VOIDS_KEEP = 0, /* voids stay voids */
+    TL_VOIDS_FILL,     /* a membrane from the rim of each hole: Laplace's equation, to 1e-5 of the heights' range */
+    TL_VOIDS_VALUE,    /* one height for all */
+} tl_void_rule;
+
+typedef struct tl_void_options {
+    tl_void_rule rule;
+    float value;       /* for TL_VOIDS_VALUE; finite */
+    const tl_run *run; /* filling reads the source once, and the surroundings of its voids twice */
+} tl_void_options;
+
+/* A source whose voids are treated by a rule; its tl_source_validity tells which samples were filled. Filling keeps
+ * the filled samples in memory, in blocks of 64 x 64, and needs about 16 bytes a sample of the box around a hole while
+ * it solves it. Voids of a raster without any valid sample stay voids. Only the source's finest level is held. */
+TL_API tl_source *tl_voids_create(const tl_source *source, const tl_void_options *options, tl_error *error);
 
 /* ---- Meshes ------------------------------------------------------------------------------------ */
 

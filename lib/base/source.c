@@ -2,6 +2,7 @@
 #include "lib/base/size.h"
 
 #include <assert.h>
+#include <math.h>
 #include <string.h>
 
 tl_status tl_source_size(const tl_source *source, int level, int64_t *width, int64_t *height, tl_error *error)
@@ -16,15 +17,45 @@ tl_status tl_source_size(const tl_source *source, int level, int64_t *width, int
     return source->size(source, level, width, height, error);
 }
 
-tl_status tl_source_read(const tl_source *source, int level, tl_window window, float *out, tl_error *error)
+/* The level must be held, and the window lie inside of it. */
+static tl_status check_window(const tl_source *source, int level, tl_window window, tl_error *error)
 {
     int64_t width, height;
     tl_status status = tl_source_size(source, level, &width, &height, error);
     if (status != TL_OK)
         return status;
+    (void)window; /* in builds without assertions */
     assert(window.x >= 0 && window.y >= 0 && window.width >= 0 && window.height >= 0);
     assert(window.width <= width - window.x && window.height <= height - window.y);
-    return source->read(source, level, window, out, error);
+    return TL_OK;
+}
+
+tl_status tl_source_read(const tl_source *source, int level, tl_window window, float *out, tl_error *error)
+{
+    tl_status status = check_window(source, level, window, error);
+    return status == TL_OK ? source->read(source, level, window, out, error) : status;
+}
+
+static tl_status validity_of_heights(const tl_source *source, int level, tl_window window, unsigned char *out,
+                                     tl_error *error)
+{
+    float *heights = tl_alloc_grid(window.width, window.height, sizeof *heights);
+    if (!heights)
+        return tl_fail_memory(error, source->info.name);
+    tl_status status = source->read(source, level, window, heights, error);
+    for (int64_t k = 0; status == TL_OK && k < window.width * window.height; k++)
+        out[k] = isnan(heights[k]) ? TL_VOID : TL_MEASURED;
+    free(heights);
+    return status;
+}
+
+tl_status tl_source_validity(const tl_source *source, int level, tl_window window, unsigned char *out, tl_error *error)
+{
+    tl_status status = check_window(source, level, window, error);
+    if (status != TL_OK)
+        return status;
+    return source->validity ? source->validity(source, level, window, out, error)
+                            : validity_of_heights(source, level, window, out, error);
 }
 
 void tl_source_destroy(tl_source *source)

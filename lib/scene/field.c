@@ -46,9 +46,15 @@ static void ground_free(ground *g)
     free(g->known);
 }
 
+static bool inside_columns(const tl_source_info *dem, fbm_window w)
+{
+    return w.i >= 0 && w.i + (int64_t)w.width <= dem->width;
+}
+
+/* Whether the DEM has all of the window; one that goes around the globe has every column. */
 static bool inside(const tl_source_info *dem, fbm_window w)
 {
-    return w.i >= 0 && w.j >= 0 && w.i + (int64_t)w.width <= dem->width && w.j + (int64_t)w.height <= dem->height;
+    return (dem->wraps || inside_columns(dem, w)) && w.j >= 0 && w.j + (int64_t)w.height <= dem->height;
 }
 
 static fbm_window widened(fbm_window w, int by)
@@ -61,27 +67,49 @@ static fbm_window widened(fbm_window w, int by)
     return w;
 }
 
-/* Reads what the DEM has of the window; the rest becomes NaN. */
-static tl_status read_ground(const tl_source *dem, fbm_window w, float *out, tl_error *error)
+/* Reads a part of the DEM to where it belongs in the window: its first sample to `out`. */
+static tl_status read_part(const tl_source *dem, tl_window part, float *out, size_t stride, tl_error *error)
 {
-    if (inside(&dem->info, w))
-        return tl_source_read(dem, 0, (tl_window){w.i, w.j, (int64_t)w.width, (int64_t)w.height}, out, error);
-    for (size_t k = 0; k < w.width * w.height; k++)
-        out[k] = NAN;
-    int64_t x0 = tl_int64_max(w.i, 0), x1 = tl_int64_min(w.i + (int64_t)w.width, dem->info.width);
-    int64_t y0 = tl_int64_max(w.j, 0), y1 = tl_int64_min(w.j + (int64_t)w.height, dem->info.height);
-    if (x0 >= x1 || y0 >= y1)
-        return TL_OK;
-    tl_window part = {x0, y0, x1 - x0, y1 - y0};
     float *heights = tl_alloc_grid(part.width, part.height, sizeof *heights);
     if (!heights)
         return tl_fail_memory(error, dem->info.name);
     tl_status status = tl_source_read(dem, 0, part, heights, error);
     for (int64_t row = 0; row < part.height && status == TL_OK; row++)
-        memcpy(out + (size_t)(y0 - w.j + row) * w.width + (size_t)(x0 - w.i), heights + row * part.width,
-               (size_t)part.width * sizeof *out);
+        memcpy(out + (size_t)row * stride, heights + row * part.width, (size_t)part.width * sizeof *out);
     free(heights);
     return status;
+}
+
+/* The rows y0 ... y1 - 1 of a window, column by column around the globe. */
+static tl_status read_around(const tl_source *dem, fbm_window w, int64_t y0, int64_t y1, float *out, tl_error *error)
+{
+    int64_t around = dem->info.width, x = (w.i % around + around) % around;
+    tl_status status = TL_OK;
+    for (int64_t done = 0, n; done < (int64_t)w.width && status == TL_OK; done += n, x = 0) {
+        n = tl_int64_min(around - x, (int64_t)w.width - done);
+        status = read_part(dem, (tl_window){x, y0, n, y1 - y0}, out + done, w.width, error);
+    }
+    return status;
+}
+
+/* Reads what the DEM has of the window; the rest becomes NaN. */
+static tl_status read_ground(const tl_source *dem, fbm_window w, float *out, tl_error *error)
+{
+    bool columns = inside_columns(&dem->info, w);
+    if (columns && inside(&dem->info, w))
+        return tl_source_read(dem, 0, (tl_window){w.i, w.j, (int64_t)w.width, (int64_t)w.height}, out, error);
+    for (size_t k = 0; k < w.width * w.height; k++)
+        out[k] = NAN;
+    int64_t y0 = tl_int64_max(w.j, 0), y1 = tl_int64_min(w.j + (int64_t)w.height, dem->info.height);
+    if (y0 >= y1)
+        return TL_OK;
+    float *first = out + (size_t)(y0 - w.j) * w.width;
+    if (dem->info.wraps && !columns)
+        return read_around(dem, w, y0, y1, first, error);
+    int64_t x0 = tl_int64_max(w.i, 0), x1 = tl_int64_min(w.i + (int64_t)w.width, dem->info.width);
+    if (x0 >= x1)
+        return TL_OK;
+    return read_part(dem, (tl_window){x0, y0, x1 - x0, y1 - y0}, first + (x0 - w.i), w.width, error);
 }
 
 /* The height of an unknown sample, from its neighbours that are known after `pass` passes: the mean, over the eight
@@ -273,6 +301,39 @@ static tl_status field_read(const tl_source *self, int level, tl_window window, 
     return TL_OK;
 }
 
+/* The least known of the samples that a refined one lies among: see cut_voids. */
+static unsigned char least_known(const unsigned char *known, tl_window g, int64_t i, int64_t j, int64_t right,
+                                 int64_t below)
+{
+    const unsigned char *at = known + (j - g.y) * g.width + i - g.x;
+    unsigned char least = at[0];
+    const unsigned char others[3] = {at[right], at[below * g.width], at[below * g.width + right]};
+    for (int k = 0; k < 3; k++)
+        least = others[k] < least ? others[k] : least;
+    return least;
+}
+
+static tl_status field_validity(const tl_source *self, int level, tl_window window, unsigned char *out, tl_error *error)
+{
+    const field *f = (const field *)self;
+    if (window.width == 0 || window.height == 0)
+        return TL_OK;
+    int64_t mask = self->info.type == TL_RASTER_AREA ? 0 : ((int64_t)1 << level) - 1;
+    tl_window g = {window.x >> level, window.y >> level, 0, 0};
+    g.width = ((window.x + window.width - 1 + mask) >> level) + 1 - g.x;
+    g.height = ((window.y + window.height - 1 + mask) >> level) + 1 - g.y;
+    unsigned char *known = tl_alloc_grid(g.width, g.height, 1);
+    if (!known)
+        return tl_fail_memory(error, self->info.name);
+    tl_status status = tl_source_validity(f->dem, 0, g, known, error);
+    for (int64_t k = 0; status == TL_OK && k < window.width * window.height; k++) {
+        int64_t x = window.x + k % window.width, y = window.y + k / window.width;
+        out[k] = least_known(known, g, x >> level, y >> level, (x & mask) != 0, (y & mask) != 0);
+    }
+    free(known);
+    return status;
+}
+
 static int64_t refined_size(int64_t samples, int level, tl_raster_type type)
 {
     return type == TL_RASTER_AREA ? samples << level : ((samples - 1) << level) + 1;
@@ -333,6 +394,7 @@ static void schedule(field *f, const tl_field_options *o, const tl_roughness *me
         fbm_step *step = &f->chain.steps[l];
         step->scheme->weights(model, &step->weights);
         step->amplitude = (float)amplitude;
+        step->period = f->dem->info.wraps ? f->dem->info.width << l : 0;
         if (l == 0)
             f->trend = (float)(exp2(2 * model - 1) - 1);
     }
@@ -394,6 +456,7 @@ static void place(field *f, int levels)
     info->height = refined_size(dem->height, levels, dem->type);
     info->level = levels;
     info->quantum = levels ? 0 : dem->quantum;
+    info->wraps = dem->wraps && (dem->type == TL_RASTER_AREA || !levels); /* points end a cell before the first */
     double *t = info->georef.transform;
     if (dem->type == TL_RASTER_AREA) { /* the first cell's centre moves towards the corner */
         double shift = 0.5 * scale - 0.5;
@@ -424,7 +487,11 @@ tl_source *tl_field_create(const tl_source *dem, const tl_field_options *options
         tl_fail_memory(error, dem->info.name);
         return NULL;
     }
-    f->source = (tl_source){.info = dem->info, .read = field_read, .size = field_size, .destroy = field_destroy};
+    f->source = (tl_source){.info = dem->info,
+                            .read = field_read,
+                            .size = field_size,
+                            .validity = field_validity,
+                            .destroy = field_destroy};
     f->source.info.parameter_count = 0;
     f->dem = dem;
     f->texts = texts;

@@ -20,6 +20,22 @@ typedef struct measurement {
     fbm_detail (*sums)[2]; /* one pair a block of the raster, so that the order of adding is fixed */
 } measurement;
 
+/* What was filled into voids is too smooth to tell anything. */
+static tl_status drop_filled(const tl_source *dem, tl_window window, float *heights, tl_error *error)
+{
+    if (!dem->validity)
+        return TL_OK;
+    unsigned char *validity = tl_alloc_grid(window.width, window.height, 1);
+    if (!validity)
+        return tl_fail_memory(error, dem->info.name);
+    tl_status status = tl_source_validity(dem, dem->info.level, window, validity, error);
+    for (int64_t k = 0; status == TL_OK && k < window.width * window.height; k++)
+        if (validity[k] == TL_FILLED)
+            heights[k] = NAN;
+    free(validity);
+    return status;
+}
+
 static tl_status measure_block(void *context, tl_parallel *loop, uint64_t item, unsigned worker, tl_error *error)
 {
     (void)loop;
@@ -35,6 +51,8 @@ static tl_status measure_block(void *context, tl_parallel *loop, uint64_t item, 
     if (!heights)
         return tl_fail_memory(error, info->name);
     tl_status status = tl_source_read(m->dem, info->level, window, heights, error);
+    if (status == TL_OK)
+        status = drop_filled(m->dem, window, heights, error);
     if (status == TL_OK)
         fbm_detail_add(heights, (size_t)window.width, (size_t)window.height, (size_t)(x - x0), (size_t)(y - y0),
                        (size_t)(tl_int64_min(x + BLOCK, info->width) - x0),
