@@ -179,3 +179,11 @@ tl_status dem_georef_measure(tl_georef *georef, int64_t width, int64_t height, t
     }
     return TL_OK;
 }
+
+bool dem_georef_goes_around(const tl_georef *georef, int64_t width)
+{
+    const double *t = georef->transform;
+    if (!georef->located || !georef->crs || !georef->crs->geographic || t[2] != 0 || t[4] != 0)
+        return false;
+    return fabs((double)width * fabs(t[1]) - 360) <= fabs(t[1]) / 2;
+}

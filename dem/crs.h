@@ -42,4 +42,7 @@ void dem_local_frame_forward(const dem_local_frame *frame, double longitude, dou
  * counts as a metre, as units of an unknown CRS do; a raster that is not located has cells of 1. */
 tl_status dem_georef_measure(tl_georef *georef, int64_t width, int64_t height, tl_error *error);
 
+/* Whether a raster in longitude and latitude goes once around: its columns are 360 degrees, to half a cell. */
+bool dem_georef_goes_around(const tl_georef *georef, int64_t width);
+
 #endif

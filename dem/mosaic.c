@@ -466,6 +466,7 @@ static tl_status describe(mosaic *m, tl_error *error)
     const double transform[6] = {own->x0, own->dx, 0, own->y0, 0, own->dy};
     memcpy(info->georef.transform, transform, sizeof transform);
     tl_crs_retain(info->georef.crs);
+    info->wraps = dem_georef_goes_around(&info->georef, info->width);
     return dem_georef_measure(&info->georef, info->width, info->height, error);
 }
 

@@ -14,13 +14,6 @@ static const double rounding = 1e-6;
 /* Lattice coordinates, and with them sizes, are below this: sums of a few of them are exact in double and in int64. */
 static const double farthest = 0x1p50;
 
-bool dem_goes_around(const tl_georef *georef, int64_t width)
-{
-    double dx = fabs(georef->transform[1]);
-    return georef->crs && tl_crs_is_geographic(georef->crs) && georef->located && georef->transform[2] == 0 &&
-           georef->transform[4] == 0 && fabs((double)width * dx - 360) <= dx / 2;
-}
-
 /* ---- Do the members go together? ---- */
 
 static tl_status check_place(const tl_source_info *info, tl_error *error)

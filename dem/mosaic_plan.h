@@ -38,7 +38,4 @@ typedef struct dem_plan {
 tl_status dem_plan_make(tl_source *const *members, size_t count, dem_plan *out, tl_error *error);
 void dem_plan_finish(dem_plan *plan);
 
-/* Whether a raster in longitude and latitude goes once around: its columns are 360 degrees, to half a cell. */
-bool dem_goes_around(const tl_georef *georef, int64_t width);
-
 #endif

@@ -130,6 +130,7 @@ static tl_status read_georef(dem_source *dem, TIFF *tiff, const tl_crs *known, t
     georef->located = dem_tiff_transform(tiff, info->type, georef->transform);
     for (int k = 0; georef->located && k < 6; k++)
         georef->transform[k] *= to_degrees;
+    info->wraps = dem_georef_goes_around(georef, info->width);
     return dem_georef_measure(georef, info->width, info->height, error);
 }
 

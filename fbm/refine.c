@@ -103,11 +103,26 @@ static float *ring_row(float *const ring[RING], int64_t row)
     return ring[row & (RING - 1)];
 }
 
+static void noise_row(const walk *w, fbm_noise_kind kind, int64_t row, int64_t first, size_t count, float *out)
+{
+    const fbm_step *step = w->step;
+    int64_t period = step->period;
+    if (period == 0) {
+        w->kernel->noise(step->seed, step->level, kind, row, first, count, out);
+        return;
+    }
+    int64_t column = (first % period + period) % period;
+    for (size_t done = 0, n; done < count; done += n, column = 0) {
+        n = (uint64_t)(period - column) < count - done ? (size_t)(period - column) : count - done;
+        w->kernel->noise(step->seed, step->level, kind, row, column, n, out + done);
+    }
+}
+
 /* The noise of `count` points, rounded up to whole vectors, for which the rows have room. */
 static void make_noise(const walk *w, float *const ring[RING], fbm_noise_kind kind, int64_t row, int64_t first,
                        size_t count)
 {
-    w->kernel->noise(w->step->seed, w->step->level, kind, row, first, (count + 7) / 8 * 8, ring_row(ring, row));
+    noise_row(w, kind, row, first, (count + 7) / 8 * 8, ring_row(ring, row));
 }
 
 static void start(walk *w, const fbm_kernel *kernel, const fbm_step *step, const float *in, fbm_window from,
@@ -209,7 +224,7 @@ static void mean_centres(const walk *w, int64_t i, int64_t j, size_t count, floa
 {
     float *noise = w->noisy ? w->partial[0] : NULL;
     if (noise)
-        w->kernel->noise(w->step->seed, w->step->level, FBM_NOISE_CENTRES, j, i, count, noise);
+        noise_row(w, FBM_NOISE_CENTRES, j, i, count, noise);
     w->kernel->mean4(input(w, i, j), input(w, i, j + 1), noise, w->centre_taps[0], out, count);
 }
 
@@ -217,7 +232,7 @@ static void mean_edges(const walk *w, fbm_noise_kind kind, int64_t j)
 {
     float *noise = w->noisy ? w->partial[0] : NULL;
     if (noise)
-        w->kernel->noise(w->step->seed, w->step->level, kind, j, w->column, w->count, noise);
+        noise_row(w, kind, j, w->column, w->count, noise);
     const float *ends = input(w, w->column, j);
     const float *others = kind == FBM_NOISE_ROW_EDGES ? ends + 1 : input(w, w->column, j + 1);
     w->kernel->mean2(ends, others, noise, w->edge_taps[0], w->edge, w->count);

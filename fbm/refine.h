@@ -47,6 +47,9 @@ typedef struct fbm_step {
     float amplitude;
     uint64_t seed;
     int32_t level; /* of the input; a key of the noise, nothing else */
+    /* Columns of the input after which the noise comes again, so that a surface that goes around a globe joins; 0: it
+     * never does. */
+    int64_t period;
 } fbm_step;
 
 /* The input window of level l from which fbm_refine makes the window `out` of level l + 1: from column

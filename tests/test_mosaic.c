@@ -640,7 +640,7 @@ static void longitudesTo360JoinThoseFromMinus180(void **state)
     tl_source *source = open_files(NULL);
     assert_int_equal(source->info.width, 360);
     assert_int_equal(source->info.height, 180);
-    assert_true(source->info.georef.transform[0] == 0.5);
+    assert_true(source->info.georef.transform[0] == 0.5 && source->info.wraps);
     expect_world(source, globe);
     expect_windows(source);
     tl_source_destroy(source);
@@ -662,8 +662,37 @@ static void aWholeGlobeOfTilesStaysWhereItIs(void **state)
     tl_source *source = open_files(NULL);
     assert_int_equal(source->info.width, 361);
     assert_true(source->info.georef.transform[0] == -180);
+    assert_false(source->info.wraps); /* its last column is the first again */
     expect_world(source, globe);
     tl_source_destroy(source);
+}
+
+static void aRasterOf360DegreesWraps(void **state)
+{
+    (void)state;
+    /* the first within half a cell of a turn, the second beyond, the third in metres */
+    static const struct {
+        double dx;
+        uint16_t epsg;
+        bool wraps;
+    } cases[] = {
+        {5, 4326, true}, {5 * (1 + 0.9 / 144), 4326, true}, {5 * (1 - 1.1 / 144), 4326, false}, {5, 32632, false}};
+    for (size_t k = 0; k < sizeof cases / sizeof *cases; k++) {
+        begin(NULL);
+        add_tile(&(tile){.x = -177.5,
+                         .y = 80,
+                         .dx = cases[k].dx,
+                         .dy = 5,
+                         .width = 72,
+                         .height = 4,
+                         .epsg = cases[k].epsg,
+                         .world = one});
+        tl_source *source = open_files(NULL);
+        assert_int_equal(source->info.wraps, cases[k].wraps);
+        tl_source_destroy(source);
+        end(NULL);
+    }
+    begin(NULL);
 }
 
 /* ---- Many files ---- */
@@ -1074,6 +1103,7 @@ int main(void)
         TEST(tilesBesideTheAntimeridianAreNeighbours),
         TEST(longitudesTo360JoinThoseFromMinus180),
         TEST(aWholeGlobeOfTilesStaysWhereItIs),
+        TEST(aRasterOf360DegreesWraps),
         TEST(hundredsOfTilesNeedFewOpenFiles),
         TEST(aFileThatChangesMeanwhileIsAnError),
         TEST(threadsReadTheSame),
