@@ -10,6 +10,7 @@
 #include <errno.h>
 #include <stdio.h>
 #include <string.h>
+#include <sys/resource.h>
 
 enum { OPEN_FILES = 64 };
 
@@ -93,11 +94,21 @@ static void close_members(opening *o)
     dem_file_pool_destroy(o->sharing.pool);
 }
 
+/* At most half of what the process may open at once: outputs need some too. */
+static unsigned open_limit(const tl_dem_options *options)
+{
+    unsigned wanted = options->open_files ? options->open_files : OPEN_FILES;
+    struct rlimit limit;
+    if (getrlimit(RLIMIT_NOFILE, &limit) == 0 && limit.rlim_cur / 2 < wanted)
+        wanted = (unsigned)(limit.rlim_cur / 2);
+    return wanted;
+}
+
 static tl_source *open_several(const dem_paths *paths, const char *name, const tl_dem_options *options, tl_error *error)
 {
     opening o = {.paths = paths, .options = options};
     o.members = calloc(paths->count, sizeof(tl_source *));
-    o.sharing.pool = dem_file_pool_create(options->open_files ? options->open_files : OPEN_FILES);
+    o.sharing.pool = dem_file_pool_create(open_limit(options));
     o.sharing.cache = dem_block_cache_create(DEM_CACHE_BYTES, 16 * (uint64_t)paths->count);
     tl_source *joined = NULL;
     if (!o.members || !o.sharing.pool || !o.sharing.cache)
