@@ -461,10 +461,13 @@ static tl_status describe(const tl_framework *framework, tl_mesh *mesh, tl_error
     char text[TL_NUMBER_TEXT];
     tl_number_text(framework->max_error, text);
     mesh->max_error = framework->max_error;
-    tl_status status = tl_mesh_add_parameter(mesh, "max_error", text, error);
+    free(mesh->parameters); /* those of the DEM, which go into "made_by" */
+    mesh->parameters = NULL;
+    mesh->parameter_count = 0;
+    tl_status status = tl_parameters_add_origin(&mesh->parameters, &mesh->parameter_count, &framework->info, error);
     if (status == TL_OK)
-        status = tl_mesh_add_parameter(mesh, "mesh", "quadtree", error);
-    return status == TL_OK ? tl_mesh_add_parameter(mesh, "talus_version", tl_version(), error) : status;
+        status = tl_mesh_add_parameter(mesh, "max_error", text, error);
+    return status == TL_OK ? tl_mesh_add_parameter(mesh, "mesh", "quadtree", error) : status;
 }
 
 static tl_status draw_all(drawing *self, const tl_run *run, tl_mesh **out, tl_error *error)

@@ -3,11 +3,11 @@
 #include "dem/membrane.h"
 #include "lib/base/error.h"
 #include "lib/base/georef.h"
+#include "lib/base/number.h"
 #include "lib/base/parallel.h"
 #include "lib/base/size.h"
 
 #include <math.h>
-#include <stdio.h>
 #include <string.h>
 
 enum {
@@ -354,23 +354,16 @@ static tl_status fill(void_source *v, const tl_run *run, tl_error *error)
 
 static tl_status note_rule(void_source *v, tl_error *error)
 {
-    const tl_source_info *info = &v->original->info;
-    char text[48] = "filled";
+    tl_source_info *info = &v->source.info;
+    char text[TL_NUMBER_TEXT] = "filled";
     if (v->rule == TL_VOIDS_VALUE)
-        snprintf(text, sizeof text, "%.9g", (double)v->value);
-    tl_parameter *list = tl_alloc(info->parameter_count + 1, sizeof *list);
-    if (list) {
-        if (info->parameter_count)
-            memcpy(list, info->parameters, info->parameter_count * sizeof *list);
-        list[info->parameter_count] = (tl_parameter){.name = "voids", .value = text};
-        v->parameters = tl_parameters_copy(list, info->parameter_count + 1);
-    }
-    free(list);
-    if (!v->parameters)
+        tl_number_text((double)v->value, text);
+    v->parameters = tl_parameters_copy(info->parameters, info->parameter_count);
+    if (info->parameter_count && !v->parameters)
         return tl_fail_memory(error, info->name);
-    v->source.info.parameters = v->parameters;
-    v->source.info.parameter_count = info->parameter_count + 1;
-    return TL_OK;
+    tl_status status = tl_parameters_add(&v->parameters, &info->parameter_count, "voids", text, error);
+    info->parameters = v->parameters;
+    return status;
 }
 
 tl_source *tl_voids_create(const tl_source *source, const tl_void_options *options, tl_error *error)

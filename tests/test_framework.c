@@ -781,7 +781,8 @@ static void frameworkCancelsAndReportsProgress(void **state)
 
 static void meshRecordsHowItWasMade(void **state)
 {
-    static const char *const expected[][2] = {{"made", "by a test"}, {"max_error", "2.5"}, {"mesh", "quadtree"}};
+    static const char *const expected[][2] = {
+        {"made_by", "made: by a test"}, {"max_error", "2.5"}, {"mesh", "quadtree"}};
     float z[4] = {0, 1, 2, 3};
     grid of = {2, 2, z};
     (void)state;
@@ -789,12 +790,12 @@ static void meshRecordsHowItWasMade(void **state)
     tl_mesh *mesh = draw(framework);
     tl_framework_destroy(framework);
     assert_true(mesh->max_error == 2.5 && mesh->georef.transform[5] == -1);
-    assert_int_equal(mesh->parameter_count, 4);
+    assert_int_equal(mesh->parameter_count, 5); /* first the version and the input's name */
+    assert_string_equal(mesh->parameters[0].value, tl_version());
     for (int k = 0; k < 3; k++) {
-        assert_string_equal(mesh->parameters[k].name, expected[k][0]);
-        assert_string_equal(mesh->parameters[k].value, expected[k][1]);
+        assert_string_equal(mesh->parameters[k + 2].name, expected[k][0]);
+        assert_string_equal(mesh->parameters[k + 2].value, expected[k][1]);
     }
-    assert_string_equal(mesh->parameters[3].value, tl_version());
     tl_mesh_destroy(mesh);
 }
 

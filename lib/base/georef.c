@@ -3,6 +3,7 @@
 #include "lib/base/error.h"
 #include "lib/base/size.h"
 
+#include <stdio.h>
 #include <string.h>
 
 tl_crs *tl_crs_allocate(void)
@@ -76,6 +77,58 @@ tl_parameter *tl_parameters_copy(const tl_parameter *parameters, size_t count)
     return copy;
 }
 
+tl_status tl_parameters_add(tl_parameter **list, size_t *count, const char *name, const char *value, tl_error *error)
+{
+    tl_parameter *longer = tl_alloc(*count + 1, sizeof *longer);
+    if (!longer)
+        return tl_fail_memory(error, "the record of parameters");
+    if (*count)
+        memcpy(longer, *list, *count * sizeof *longer);
+    longer[*count] = (tl_parameter){.name = name, .value = value};
+    tl_parameter *copy = tl_parameters_copy(longer, *count + 1);
+    free(longer);
+    if (!copy)
+        return tl_fail_memory(error, "the record of parameters");
+    free(*list);
+    *list = copy;
+    ++*count;
+    return TL_OK;
+}
+
+/* "name: value; name: value", to be freed; NULL when out of memory. */
+static char *join_parameters(const tl_parameter *parameters, size_t count)
+{
+    size_t bytes = 1;
+    for (size_t i = 0; i < count; i++)
+        bytes += strlen(parameters[i].name) + strlen(parameters[i].value) + 4;
+    char *text = malloc(bytes), *at = text;
+    for (size_t i = 0; text && i < count; i++)
+        at += snprintf(at, bytes - (size_t)(at - text), "%s%s: %s", i ? "; " : "", parameters[i].name,
+                       parameters[i].value);
+    return text;
+}
+
+tl_status tl_parameters_add_origin(tl_parameter **list, size_t *count, const tl_source_info *input, tl_error *error)
+{
+    const char *slash = strrchr(input->name, '/');
+    char *name = strdup(slash ? slash + 1 : input->name);
+    char *made_by = input->parameter_count ? join_parameters(input->parameters, input->parameter_count) : NULL;
+    tl_status status = TL_OK;
+    if (!name || (input->parameter_count && !made_by))
+        status = tl_fail_memory(error, "the record of parameters");
+    if (status == TL_OK)
+        status = tl_parameters_add(list, count, "version", tl_version(), error);
+    if (status == TL_OK) {
+        tl_make_printable(name); /* any bytes may stand in a file's name */
+        status = tl_parameters_add(list, count, "input", name, error);
+    }
+    if (status == TL_OK && made_by)
+        status = tl_parameters_add(list, count, "made_by", made_by, error);
+    free(name);
+    free(made_by);
+    return status;
+}
+
 tl_mesh *tl_mesh_create(size_t vertices, size_t triangles, const tl_source_info *grid, tl_error *error)
 {
     tl_mesh *mesh = calloc(1, sizeof *mesh);
@@ -101,21 +154,7 @@ tl_mesh *tl_mesh_create(size_t vertices, size_t triangles, const tl_source_info 
 
 tl_status tl_mesh_add_parameter(tl_mesh *mesh, const char *name, const char *value, tl_error *error)
 {
-    size_t count = mesh->parameter_count + 1;
-    tl_parameter *list = tl_alloc(count, sizeof *list);
-    if (!list)
-        return tl_fail_memory(error, "the mesh's parameters");
-    if (mesh->parameter_count)
-        memcpy(list, mesh->parameters, mesh->parameter_count * sizeof *list);
-    list[count - 1] = (tl_parameter){.name = name, .value = value};
-    tl_parameter *copy = tl_parameters_copy(list, count);
-    free(list);
-    if (!copy)
-        return tl_fail_memory(error, "the mesh's parameters");
-    free(mesh->parameters);
-    mesh->parameters = copy;
-    mesh->parameter_count = count;
-    return TL_OK;
+    return tl_parameters_add(&mesh->parameters, &mesh->parameter_count, name, value, error);
 }
 
 void tl_mesh_destroy(tl_mesh *mesh)

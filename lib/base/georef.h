@@ -37,6 +37,12 @@ tl_mesh *tl_mesh_create(size_t vertices, size_t triangles, const tl_source_info 
 /* Adds a parameter to a mesh's record (copies both strings). */
 tl_status tl_mesh_add_parameter(tl_mesh *mesh, const char *name, const char *value, tl_error *error);
 
+/* Adds a parameter (copies of both strings) to a list that free() frees, as tl_parameters_copy makes them. */
+tl_status tl_parameters_add(tl_parameter **list, size_t *count, const char *name, const char *value, tl_error *error);
+/* Adds what every record begins with: this version, the input's name without its folders, and how the input was made
+ * itself, where it has a record ("made_by": "name: value; ..."). */
+tl_status tl_parameters_add_origin(tl_parameter **list, size_t *count, const tl_source_info *input, tl_error *error);
+
 /* Deep copy of `count` parameters, one block that free() frees; NULL for none, or when out of memory. */
 tl_parameter *tl_parameters_copy(const tl_parameter *parameters, size_t count);
 

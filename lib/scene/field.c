@@ -9,7 +9,6 @@
 
 #include <assert.h>
 #include <math.h>
-#include <stdarg.h>
 #include <stdio.h>
 #include <string.h>
 
@@ -19,7 +18,6 @@ enum {
      * most half a cell outside of a known sample, and the halo of the refinement converges to 8 cells. */
     GROWTH = 10,
     GROWTH_REACH = 2 * GROWTH, /* how far a made-up sample can see: two cells a pass */
-    MAX_PARAMETERS = 10,
 };
 
 typedef struct field {
@@ -27,8 +25,7 @@ typedef struct field {
     const tl_source *dem;
     scene_chain chain;
     float trend; /* how far a slope goes on beyond the rim: see grow_sample */
-    tl_parameter parameters[MAX_PARAMETERS];
-    char *texts; /* of the parameters */
+    tl_parameter *parameters;
 } field;
 
 /* ---- level 0: the samples, and what is made up around them ---- */
@@ -353,7 +350,7 @@ static void field_destroy(tl_source *self)
 {
     field *f = (field *)self;
     tl_crs_release(self->info.georef.crs);
-    free(f->texts);
+    free(f->parameters);
     free(f);
 }
 
@@ -400,51 +397,29 @@ static void schedule(field *f, const tl_field_options *o, const tl_roughness *me
     }
 }
 
-static void note(field *f, const char *name, size_t *used, const char *format, ...)
-    __attribute__((format(printf, 4, 5)));
-
-enum { TEXT_LIMIT = 2048 };
-
-static void note(field *f, const char *name, size_t *used, const char *format, ...)
+/* The record: pairs of name and value. */
+static tl_status note_all(field *f, const tl_field_options *o, const tl_roughness *measured, tl_error *error)
 {
-    assert(f->source.info.parameter_count < MAX_PARAMETERS);
-    va_list arguments;
-    va_start(arguments, format);
-    int length = vsnprintf(f->texts + *used, TEXT_LIMIT - *used, format, arguments);
-    va_end(arguments);
-    f->parameters[f->source.info.parameter_count++] = (tl_parameter){.name = name, .value = f->texts + *used};
-    size_t next = *used + (size_t)(length > 0 ? length : 0) + 1;
-    *used = next < TEXT_LIMIT - 1 ? next : TEXT_LIMIT - 1;
-}
-
-/* The file's name without its folders: any bytes, made fit for a record. */
-static void note_input(field *f, size_t *used)
-{
-    const char *name = f->dem->info.name, *slash = strrchr(name, '/');
-    char text[500];
-    snprintf(text, sizeof text, "%s", slash ? slash + 1 : name);
-    tl_make_printable(text);
-    note(f, "input", used, "%s", text);
-}
-
-static void note_all(field *f, const tl_field_options *o, const tl_roughness *measured)
-{
-    size_t used = 0;
-    char number[TL_NUMBER_TEXT];
-    note(f, "version", &used, "%s", tl_version());
-    note_input(f, &used);
-    note(f, "levels", &used, "%d", o->levels);
-    note(f, "scheme", &used, "%s", f->chain.steps[0].scheme->name);
-    note(f, "seed", &used, "%llu", (unsigned long long)o->seed);
-    tl_number_text(o->hurst, number);
-    note(f, "hurst", &used, "%s", o->hurst_given ? number : "measured");
-    tl_number_text(o->delta, number);
-    note(f, "delta", &used, "%s", o->delta_given ? number : "measured");
+    char levels[TL_NUMBER_TEXT], seed[TL_NUMBER_TEXT], hurst[TL_NUMBER_TEXT] = "measured",
+                                                       delta[TL_NUMBER_TEXT] = "measured";
+    char found[80] = "nothing: too small or too flat, so no detail is added";
+    snprintf(levels, sizeof levels, "%d", o->levels);
+    snprintf(seed, sizeof seed, "%llu", (unsigned long long)o->seed);
+    if (o->hurst_given)
+        tl_number_text(o->hurst, hurst);
+    if (o->delta_given)
+        tl_number_text(o->delta, delta);
     if (measured->measurable)
-        note(f, "measured", &used, "sigma %.6g, exponent %.4g", measured->sigma, measured->hurst);
-    else if (!o->delta_given)
-        note(f, "measured", &used, "nothing: too small or too flat, so no detail is added");
+        snprintf(found, sizeof found, "sigma %.6g, exponent %.4g", measured->sigma, measured->hurst);
+    const tl_parameter all[] = {{"levels", levels}, {"scheme", f->chain.steps[0].scheme->name},
+                                {"seed", seed},     {"hurst", hurst},
+                                {"delta", delta},   {"measured", found}};
+    size_t count = sizeof all / sizeof *all - (o->hurst_given && o->delta_given);
+    tl_status status = tl_parameters_add_origin(&f->parameters, &f->source.info.parameter_count, &f->dem->info, error);
+    for (size_t i = 0; i < count && status == TL_OK; i++)
+        status = tl_parameters_add(&f->parameters, &f->source.info.parameter_count, all[i].name, all[i].value, error);
     f->source.info.parameters = f->parameters;
+    return status;
 }
 
 static void place(field *f, int levels)
@@ -480,10 +455,7 @@ tl_source *tl_field_create(const tl_source *dem, const tl_field_options *options
     if (!(o->hurst_given && o->delta_given) && tl_roughness_measure(dem, o->run, &measured, error) != TL_OK)
         return NULL;
     field *f = calloc(1, sizeof *f);
-    char *texts = malloc(TEXT_LIMIT);
-    if (!f || !texts) {
-        free(f);
-        free(texts);
+    if (!f) {
         tl_fail_memory(error, dem->info.name);
         return NULL;
     }
@@ -492,14 +464,16 @@ tl_source *tl_field_create(const tl_source *dem, const tl_field_options *options
                             .size = field_size,
                             .validity = field_validity,
                             .destroy = field_destroy};
-    f->source.info.parameter_count = 0;
+    f->source.info.parameter_count = 0; /* the record is its own */
+    f->source.info.parameters = NULL;
     f->dem = dem;
-    f->texts = texts;
     tl_crs_retain(f->source.info.georef.crs);
     for (int l = 0; l <= SCENE_LEVEL_MAX; l++)
         f->chain.steps[l] = (fbm_step){.scheme = scheme, .seed = o->seed, .level = l};
     schedule(f, o, &measured);
     place(f, o->levels);
-    note_all(f, o, &measured);
-    return &f->source;
+    if (note_all(f, o, &measured, error) == TL_OK)
+        return &f->source;
+    field_destroy(&f->source);
+    return NULL;
 }

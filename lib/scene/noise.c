@@ -15,8 +15,6 @@ enum {
     COARSE_CELLS = 256, /* cells on a side of the exact field, at most */
     HALO = 8,           /* coarse samples beyond it that refinement can see; converges to this (see chain) */
     BLOCK = 512,
-    PARAMETERS = 6,
-    TEXT_LIMIT = 64,
 };
 
 typedef struct noise {
@@ -25,8 +23,7 @@ typedef struct noise {
     int levels;   /* refinements of the exact field */
     int64_t side; /* of the exact field, halo included */
     float *exact;
-    tl_parameter parameters[PARAMETERS];
-    char texts[PARAMETERS][TEXT_LIMIT];
+    tl_parameter *parameters;
 } noise;
 
 static tl_status load(void *context, fbm_window window, float *buffer, tl_error *error)
@@ -59,8 +56,10 @@ static tl_status noise_read(const tl_source *self, int level, tl_window window, 
 
 static void noise_destroy(tl_source *self)
 {
-    free(((noise *)self)->exact);
-    free(self);
+    noise *n = (noise *)self;
+    free(n->exact);
+    free(n->parameters);
+    free(n);
 }
 
 static tl_status check(const tl_noise_options *o, tl_error *error)
@@ -83,26 +82,22 @@ static tl_status make_exact(noise *n, const tl_noise_options *o, tl_error *error
     return status == FBM_OK ? TL_OK : tl_fail_memory(error, "the exact coarse field");
 }
 
-static void note(noise *n, const char *name, const char *text)
+static tl_status note_all(noise *n, const tl_noise_options *o, const fbm_scheme *scheme, tl_error *error)
 {
-    size_t k = n->source.info.parameter_count++;
-    snprintf(n->texts[k], TEXT_LIMIT, "%s", text);
-    n->parameters[k] = (tl_parameter){.name = name, .value = n->texts[k]};
-}
-
-static void note_all(noise *n, const tl_noise_options *o, const fbm_scheme *scheme)
-{
-    char text[TEXT_LIMIT];
-    note(n, "version", tl_version());
-    note(n, "input", "noise");
-    note(n, "scheme", scheme->name);
-    snprintf(text, sizeof text, "%llu", (unsigned long long)o->seed);
-    note(n, "seed", text);
-    tl_number_text(o->hurst, text);
-    note(n, "hurst", text);
-    tl_number_text(o->delta, text);
-    note(n, "delta", text);
-    n->source.info.parameters = n->parameters;
+    char seed[TL_NUMBER_TEXT], hurst[TL_NUMBER_TEXT], delta[TL_NUMBER_TEXT];
+    snprintf(seed, sizeof seed, "%llu", (unsigned long long)o->seed);
+    tl_number_text(o->hurst, hurst);
+    tl_number_text(o->delta, delta);
+    const tl_parameter all[] = {{"scheme", scheme->name}, {"seed", seed}, {"hurst", hurst}, {"delta", delta}};
+    tl_source_info *info = &n->source.info;
+    tl_parameter *list = NULL;
+    size_t count = 0;
+    tl_status status = tl_parameters_add_origin(&list, &count, info, error);
+    for (size_t i = 0; i < sizeof all / sizeof *all && status == TL_OK; i++)
+        status = tl_parameters_add(&list, &count, all[i].name, all[i].value, error);
+    info->parameters = n->parameters = list;
+    info->parameter_count = count;
+    return status;
 }
 
 tl_source *tl_noise_create(const tl_noise_options *o, tl_error *error)
@@ -132,8 +127,7 @@ tl_source *tl_noise_create(const tl_noise_options *o, tl_error *error)
         scheme->weights(o->hurst, &step->weights);
         step->amplitude = (float)(o->delta * exp2(o->hurst * (n->levels - l)));
     }
-    note_all(n, o, scheme);
-    if (make_exact(n, o, error) != TL_OK) {
+    if (note_all(n, o, scheme, error) != TL_OK || make_exact(n, o, error) != TL_OK) {
         noise_destroy(&n->source);
         return NULL;
     }
