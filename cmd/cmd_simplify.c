@@ -1,6 +1,7 @@
 #include "cmd/command.h"
 
 #include <stdio.h>
+#include <sys/stat.h>
 
 static const char *const frames[] = {[TL_FRAME_DEFAULT] = "default",
                                      [TL_FRAME_ENU] = "enu",
@@ -69,6 +70,11 @@ static int simplify(const settings *set, const char *input)
     progress bar;
     tl_error error;
     tl_run run = command_run(&set->common, &bar);
+    struct stat there; /* told before the work; tl_write_mesh looks again */
+    if (!set->common.overwrite && lstat(set->common.output, &there) == 0) {
+        complain("%s: exists already; name another file or give --overwrite", set->common.output);
+        return EXIT_FAILED;
+    }
     tl_source *dem = tl_open(input, &error);
     if (!dem)
         return command_failed(&bar, &error);
