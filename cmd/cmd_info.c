@@ -15,6 +15,7 @@ typedef struct facts {
     const tl_source_info *info;
     tl_dem_details details; /* of a GeoTIFF only */
     bool has_details;
+    const tl_source *source;
     tl_range range;
     tl_roughness roughness;
 } facts;
@@ -88,6 +89,38 @@ static json_t *file_json(const tl_dem_details *d)
                      "offset", d->offset, "overviews", (int)d->overviews, "bytes", (json_int_t)d->bytes);
 }
 
+/* The files of a mosaic; of nothing else, for one file is told of in full. */
+static size_t file_count(const facts *f)
+{
+    size_t count = tl_dem_member_count(f->source);
+    return count > 1 ? count : 0;
+}
+
+static json_t *files_json(const facts *f)
+{
+    json_t *list = json_array();
+    tl_dem_member m;
+    for (size_t k = 0; k < file_count(f) && tl_dem_get_member(f->source, k, &m, NULL) == TL_OK; k++)
+        json_array_append_new(list, json_pack("{s:o, s:I, s:I, s:[I,I,I,I], s:b}", "name", string(m.source->info.name),
+                                              "width", (json_int_t)m.source->info.width, "height",
+                                              (json_int_t)m.source->info.height, "window", (json_int_t)m.window.x,
+                                              (json_int_t)m.window.y, (json_int_t)m.window.width,
+                                              (json_int_t)m.window.height, "interpolated", m.resampled));
+    return list;
+}
+
+static void print_files(const facts *f)
+{
+    tl_dem_member m;
+    size_t count = file_count(f);
+    if (count)
+        printf("files        %zu\n", count);
+    for (size_t k = 0; k < count && tl_dem_get_member(f->source, k, &m, NULL) == TL_OK; k++)
+        printf("             %s: %lld x %lld at column %lld, row %lld%s\n", m.source->info.name,
+               (long long)m.source->info.width, (long long)m.source->info.height, (long long)m.window.x,
+               (long long)m.window.y, m.resampled ? ", interpolated" : "");
+}
+
 static void print_json(const facts *f)
 {
     const tl_source_info *info = f->info;
@@ -96,6 +129,8 @@ static void print_json(const facts *f)
                                "raster_type", info->type == TL_RASTER_AREA ? "area" : "point", "quantum", info->quantum,
                                "georeference", georef_json(info));
     json_object_set_new(object, "file", f->has_details ? file_json(&f->details) : json_null());
+    if (file_count(f))
+        json_object_set_new(object, "files", files_json(f));
     json_object_set_new(object, "heights",
                         json_pack("{s:o, s:o, s:o, s:I, s:I}", "low", number((double)f->range.low), "high",
                                   number((double)f->range.high), "mean", number(f->range.mean), "samples",
@@ -163,6 +198,7 @@ static void print_text(const facts *f)
            info->type == TL_RASTER_AREA ? "each the mean of its cell (area)" : "each a point");
     if (f->has_details)
         print_file(&f->details);
+    print_files(f);
     print_place(info);
     const tl_range *r = &f->range;
     if (r->voids < r->samples)
@@ -180,15 +216,15 @@ static void print_text(const facts *f)
                info->parameters[i].value);
 }
 
-static int inform(const settings *set, const char *input)
+static int inform(const settings *set, const arguments *inputs)
 {
     progress bar;
     tl_error error;
     tl_run run = command_run(&set->common, &bar);
-    tl_source *source = tl_open(input, &error);
+    tl_source *source = command_open(&set->common, inputs, &run, &error);
     if (!source)
         return command_failed(&bar, &error);
-    facts f = {.info = &source->info};
+    facts f = {.info = &source->info, .source = source};
     f.has_details = tl_dem_get_details(source, &f.details, NULL) == TL_OK;
     int status = EXIT_DONE;
     progress_stage(&bar, "reading");
@@ -209,16 +245,16 @@ static int run(const command *self, int argc, const char **argv, bool help)
     settings set = {0};
     const option output[] = {
         {"json", 'j', OPTION_FLAG, &set.json, NULL, NULL, "for machines: one JSON object", 0, 0, NULL}, {0}};
+    const option input[] = {COMMON_INPUT(set.common), {0}};
     const option running[] = {COMMON_RUNNING(set.common), {0}};
-    const option_group groups[] = {{"Output", output}, {"Running", running}, {0}};
+    const option_group groups[] = {{"Output", output}, {"Input", input}, {"Running", running}, {0}};
     arguments rest;
     int status;
-    if (!command_begin(self, argc, argv, help, groups, 1, &rest, &status))
+    if (!command_begin(self, argc, argv, help, groups, -1, &rest, &status))
         return status;
-    status = inform(&set, rest.names[0]);
+    status = inform(&set, &rest);
     arguments_free(&rest);
     return status;
 }
 
-const command command_info = {"info", "tell what a raster holds", "RASTER [--json]",
-                              "RASTER is a GeoTIFF, or an EXR that talus wrote.", run};
+const command command_info = {"info", "tell what a raster holds", "RASTER... [--json]", INPUT_NOTES, run};

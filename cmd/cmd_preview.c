@@ -50,13 +50,13 @@ static bool settings_ok(settings *set)
     return true;
 }
 
-static int draw(settings *set, const char *input)
+static int draw(settings *set, const arguments *inputs)
 {
     progress bar;
     tl_error error;
     tl_run run = command_run(&set->common, &bar);
     set->preview.run = &run;
-    tl_source *source = tl_open(input, &error);
+    tl_source *source = command_open(&set->common, inputs, &run, &error);
     tl_source *beside = source && set->beside ? tl_open(set->beside, &error) : NULL;
     int status = EXIT_DONE;
     progress_stage(&bar, "drawing");
@@ -99,22 +99,28 @@ static int run(const command *self, int argc, const char **argv, bool help)
         {"fov", 0, OPTION_NUMBER, &set.preview.fov, NULL, "DEG", "horizontal field of view, 1...170 (default: 50)", 1,
          170, NULL},
         {0}};
+    const option input[] = {COMMON_INPUT(set.common), {0}};
     const option output[] = {COMMON_OUTPUT(set.common), {0}};
     const option running[] = {COMMON_RUNNING(set.common), {0}};
-    const option_group groups[] = {{"Picture", picture}, {"Light", light},     {"View", view},
-                                   {"Output", output},   {"Running", running}, {0}};
+    const option_group groups[] = {{"Picture", picture},
+                                   {"Light", light},
+                                   {"View", view},
+                                   {"Input", input},
+                                   {"Output", output},
+                                   {"Running", running},
+                                   {0}};
     arguments rest;
     int status;
-    if (!command_begin(self, argc, argv, help, groups, 1, &rest, &status))
+    if (!command_begin(self, argc, argv, help, groups, -1, &rest, &status))
         return status;
-    status = settings_ok(&set) ? draw(&set, rest.names[0]) : EXIT_USAGE;
+    status = settings_ok(&set) ? draw(&set, &rest) : EXIT_USAGE;
     arguments_free(&rest);
     return status;
 }
 
 const command command_preview = {
-    "preview", "draw a raster: hillshade, or a perspective", "RASTER -o PICTURE.png",
-    "RASTER is a GeoTIFF, or an EXR that talus wrote. Voids are transparent.\n\n"
-    "Examples: talus preview terrain.exr -o look.png\n"
-    "          talus preview terrain.exr --eye -84.3,36.4,3000 --target -84.2,36.5,400 -o view.png",
+    "preview", "draw a raster: hillshade, or a perspective", "RASTER... -o PICTURE.png",
+    INPUT_NOTES "\n\nVoids are transparent.\n\n"
+                "Examples: talus preview terrain.exr -o look.png\n"
+                "          talus preview terrain.exr --eye -84.3,36.4,3000 --target -84.2,36.5,400 -o view.png",
     run};

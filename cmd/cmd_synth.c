@@ -47,12 +47,12 @@ static int write_out(const settings *set, const tl_source *made, const tl_run *r
 
 /* ---- synth ---- */
 
-static int synth(settings *set, const char *input)
+static int synth(settings *set, const arguments *inputs)
 {
     progress bar;
     tl_error error;
     tl_run run = command_run(&set->common, &bar);
-    tl_source *dem = tl_open(input, &error);
+    tl_source *dem = command_open(&set->common, inputs, &run, &error);
     if (!dem)
         return command_failed(&bar, &error);
     progress_stage(&bar, "measuring");
@@ -99,6 +99,7 @@ static int run_synth(const command *self, int argc, const char **argv, bool help
         {"scheme", 0, OPTION_TEXT, &set.field.scheme, NULL, "NAME", "way to refine, listed below (default: the first)",
          0, 0, NULL},
         {0}};
+    const option input[] = {COMMON_INPUT(set.common), {0}};
     const option output[] = {COMMON_OUTPUT(set.common),
                              {"compression", 0, OPTION_CHOICE, &set.compression, NULL, "KIND",
                               "of .exr and .tif (default: zip)", 0, 0, compressions},
@@ -106,10 +107,10 @@ static int run_synth(const command *self, int argc, const char **argv, bool help
                               "coordinates of a mesh (default: enu where the CRS is known)", 0, 0, frames},
                              {0}};
     const option running[] = {COMMON_RUNNING(set.common), {0}};
-    const option_group groups[] = {{"Detail", detail}, {"Output", output}, {"Running", running}, {0}};
+    const option_group groups[] = {{"Detail", detail}, {"Input", input}, {"Output", output}, {"Running", running}, {0}};
     arguments rest;
     int status;
-    if (!command_begin(self, argc, argv, help, groups, 1, &rest, &status)) {
+    if (!command_begin(self, argc, argv, help, groups, -1, &rest, &status)) {
         if (help || status == EXIT_DONE)
             list_schemes();
         return status;
@@ -117,16 +118,16 @@ static int run_synth(const command *self, int argc, const char **argv, bool help
     set.field.levels = (int)set.levels;
     set.field.seed = (uint64_t)set.seed;
     bool good = (!set.field.scheme || names_scheme(set.field.scheme)) && command_output_ok(&set.common, true, true);
-    status = good ? synth(&set, rest.names[0]) : EXIT_USAGE;
+    status = good ? synth(&set, &rest) : EXIT_USAGE;
     arguments_free(&rest);
     return status;
 }
 
-const command command_synth = {"synth", "add fractal detail below the samples of an elevation model",
-                               "DEM [--levels N] -o OUTPUT",
-                               "Formats: .exr, .tif, .png (16 bit, with a .json beside it), .glb, .obj, .ply.\n\n"
-                               "Example: talus synth dem.tif --levels 4 --seed 7 -o terrain.exr",
-                               run_synth};
+const command command_synth = {
+    "synth", "add fractal detail below the samples of an elevation model", "DEM... [--levels N] -o OUTPUT",
+    INPUT_NOTES "\n\nFormats: .exr, .tif, .png (16 bit, with a .json beside it), .glb, .obj, .ply.\n\n"
+                "Example: talus synth dem.tif --levels 4 --seed 7 -o terrain.exr",
+    run_synth};
 
 /* ---- noise ---- */
 

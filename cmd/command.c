@@ -2,6 +2,7 @@
 
 #include <errno.h>
 #include <stdarg.h>
+#include <stdint.h>
 #include <stdio.h>
 #include <string.h>
 
@@ -27,8 +28,9 @@ bool command_begin(const command *self, int argc, const char **argv, bool help, 
         *status = command_done();
         return false;
     }
-    if (result == PARSE_OK && inputs >= 0 && rest->count != (size_t)inputs) {
-        if (rest->count > (size_t)inputs)
+    size_t least = inputs < 0 ? 1 : (size_t)inputs, most = inputs < 0 ? SIZE_MAX : (size_t)inputs;
+    if (result == PARSE_OK && (rest->count < least || rest->count > most)) {
+        if (rest->count > most)
             complain("'%s' is one argument too many; the output goes behind -o", rest->names[inputs]);
         else
             complain("an input file is missing");
@@ -52,6 +54,16 @@ tl_run command_run(const common *options, progress *bar)
 {
     return progress_run(bar, options->quiet ? PROGRESS_NONE : (progress_style)options->progress,
                         (unsigned)options->threads);
+}
+
+tl_source *command_open(const common *options, const arguments *inputs, const tl_run *run, tl_error *error)
+{
+    /* opening has no progress to speak of */
+    const tl_run quietly = {.threads = run->threads, .cancel = run->cancel};
+    const tl_dem_options dem = {.feather = options->feather, .run = &quietly};
+    if (inputs->count == 1 && !options->feather)
+        return tl_open(inputs->names[0], error);
+    return tl_dem_open(inputs->names, inputs->count, &dem, error);
 }
 
 int command_failed(progress *bar, const tl_error *error)

@@ -20,12 +20,18 @@ extern const command command_info, command_simplify, command_synth, command_prev
 /* Options that most commands have. */
 typedef struct common {
     const char *output;
-    bool overwrite, quiet;
+    bool overwrite, quiet, feather;
     int64_t threads;
     int progress; /* index into the names of progress_style */
 } common;
 
 /* The rows of the options in a `common`, for use inside of an array of options. */
+#define COMMON_INPUT(c)                                                                                            \
+    {                                                                                                              \
+        "feather", 0, OPTION_FLAG, &(c).feather, NULL, NULL,                                                       \
+            "blend files where they overlap, over at most 32 samples (default: the finest, then the first)", 0, 0, \
+            NULL                                                                                                   \
+    }
 #define COMMON_OUTPUT(c)                                                                                       \
     {"output", 'o', OPTION_TEXT, &(c).output, NULL, "FILE", "where to write; the ending chooses the format",   \
      0,        0,   NULL},                                                                                     \
@@ -51,13 +57,20 @@ typedef struct common {
 
 extern const char *const progress_names[];
 
-/* Parses the command's options and checks that `inputs` file names stand beside them (-1: any number). False: the
+/* Parses the command's options and checks that `inputs` file names stand beside them (-1: one or more). False: the
  * caller ends with *status. */
 bool command_begin(const command *self, int argc, const char **argv, bool help, const option_group *groups, int inputs,
                    arguments *rest, int *status);
 
 /* The tl_run of a command; reports to *bar. */
 tl_run command_run(const common *options, progress *bar);
+/* Opens the inputs as one source: an EXR, or elevation models. */
+tl_source *command_open(const common *options, const arguments *inputs, const tl_run *run, tl_error *error);
+/* What COMMAND's help says of its inputs. */
+#define INPUT_NOTES                                                                                                 \
+    "Inputs are GeoTIFFs, SRTM .hgt files, directories of them, patterns or @LIST (a file of names); several make " \
+    "one\n"                                                                                                         \
+    "elevation model, in which the finest wins where they overlap, then the first. Or one EXR that talus wrote."
 /* Tells the error on stderr; the exit status that it means. */
 int command_failed(progress *bar, const tl_error *error);
 /* A line on stderr, unless quiet. */

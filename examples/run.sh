@@ -29,7 +29,7 @@ Done. In $out:
 
 To try next:
   $talus info "$dem"
-  $talus synth "$dem" --levels 6 --seed 2 -o other.exr     another seed, finer still
+  $talus synth "$dem" --levels 3 --seed 2 -o other.tif     another seed, as a GeoTIFF
   $talus synth "$dem" --levels 2 -o terrain.glb            as a mesh for Blender
   $talus help synth
 END
