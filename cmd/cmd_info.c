@@ -25,8 +25,8 @@ static void extent(const tl_source_info *info, double low[2], double high[2])
 {
     double margin = info->type == TL_RASTER_AREA ? 0.5 : 0;
     const double *t = info->georef.transform;
-    low[0] = low[1] = INFINITY;
-    high[0] = high[1] = -INFINITY;
+    low[0] = low[1] = (double)INFINITY;
+    high[0] = high[1] = -(double)INFINITY;
     for (int corner = 0; corner < 4; corner++) {
         double i = corner & 1 ? (double)info->width - 1 + margin : -margin;
         double j = corner & 2 ? (double)info->height - 1 + margin : -margin;

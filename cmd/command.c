@@ -63,7 +63,7 @@ tl_source *command_open(const common *options, const arguments *inputs, const tl
     const tl_dem_options dem = {.feather = options->feather, .run = &quietly};
     if (inputs->count == 1 && !options->feather)
         return tl_open(inputs->names[0], error);
-    return tl_dem_open(inputs->names, inputs->count, &dem, error);
+    return tl_dem_open((const char *const *)inputs->names, inputs->count, &dem, error);
 }
 
 int command_failed(progress *bar, const tl_error *error)

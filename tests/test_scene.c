@@ -364,9 +364,9 @@ static void optionsOutOfRangeAreTold(void **state)
         {.levels = 31},
         {.scheme = "none such"},
         {.hurst = 1, .hurst_given = true},
-        {.hurst = NAN, .hurst_given = true},
+        {.hurst = (double)NAN, .hurst_given = true},
         {.delta = -1, .delta_given = true},
-        {.delta = INFINITY, .delta_given = true},
+        {.delta = (double)INFINITY, .delta_given = true},
     };
     ground g;
     ground_make(&g, TL_RASTER_AREA, 0);

@@ -109,7 +109,7 @@ static void harmonicSurfacesComeBack(void **state)
             raster_make(&r, sizes[s][0], sizes[s][1], holes[h]);
             tl_source *full = filled(&r, NULL);
             float *heights = read_all(full);
-            double low = INFINITY, high = -INFINITY;
+            double low = (double)INFINITY, high = -low;
             for (int64_t k = 0; k < r.width * r.height; k++) {
                 low = fmin(low, (double)r.truth[k]);
                 high = fmax(high, (double)r.truth[k]);

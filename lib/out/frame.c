@@ -29,7 +29,8 @@ static void position(const tl_georef *g, double i, double j, double *x, double *
 /* The middle of the vertices' box at their middle height, so that float coordinates are small everywhere. */
 static void set_origin(out_frame *frame, const tl_mesh *mesh)
 {
-    double low[3] = {INFINITY, INFINITY, INFINITY}, high[3] = {-INFINITY, -INFINITY, -INFINITY};
+    const double far = (double)INFINITY; /* a float constant */
+    double low[3] = {far, far, far}, high[3] = {-far, -far, -far};
     for (size_t k = 0; k < mesh->vertex_count; k++) {
         const double at[3] = {mesh->vertices[k].i, mesh->vertices[k].j, (double)mesh->vertices[k].z};
         for (int a = 0; a < 3; a++) {
