@@ -221,7 +221,8 @@ static int inform(const settings *set, const arguments *inputs)
     progress bar;
     tl_error error;
     tl_run run = command_run(&set->common, &bar);
-    tl_source *source = command_open(&set->common, inputs, &run, &error);
+    opened_input opened = command_open(&set->common, inputs, &run, &error);
+    const tl_source *source = opened.source;
     if (!source)
         return command_failed(&bar, &error);
     facts f = {.info = &source->info, .source = source};
@@ -236,7 +237,7 @@ static int inform(const settings *set, const arguments *inputs)
         (set->json ? print_json : print_text)(&f);
         status = command_done();
     }
-    tl_source_destroy(source);
+    command_close(&opened);
     return status;
 }
 

@@ -56,7 +56,8 @@ static int draw(settings *set, const arguments *inputs)
     tl_error error;
     tl_run run = command_run(&set->common, &bar);
     set->preview.run = &run;
-    tl_source *source = command_open(&set->common, inputs, &run, &error);
+    opened_input opened = command_open(&set->common, inputs, &run, &error);
+    const tl_source *source = opened.source;
     tl_source *beside = source && set->beside ? tl_open(set->beside, &error) : NULL;
     int status = EXIT_DONE;
     progress_stage(&bar, "drawing");
@@ -66,7 +67,7 @@ static int draw(settings *set, const arguments *inputs)
     else
         command_say(&set->common, "%s: drawn in %.2f s", set->common.output, progress_end(&bar));
     tl_source_destroy(beside);
-    tl_source_destroy(source);
+    command_close(&opened);
     return status;
 }
 

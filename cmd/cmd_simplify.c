@@ -65,7 +65,7 @@ static void report(const settings *set, const tl_source *dem, const tl_framework
         command_say(&set->common, "%zu valid samples lie alone among voids and are in no triangle", isolated);
 }
 
-static int simplify(const settings *set, const char *input)
+static int simplify(const settings *set, const arguments *inputs)
 {
     progress bar;
     tl_error error;
@@ -75,7 +75,8 @@ static int simplify(const settings *set, const char *input)
         complain("%s: exists already; name another file or give --overwrite", set->common.output);
         return EXIT_FAILED;
     }
-    tl_source *dem = tl_open(input, &error);
+    opened_input opened = command_open(&set->common, inputs, &run, &error);
+    const tl_source *dem = opened.source;
     if (!dem)
         return command_failed(&bar, &error);
     progress_stage(&bar, "simplifying");
@@ -93,7 +94,7 @@ static int simplify(const settings *set, const char *input)
     }
     tl_mesh_destroy(mesh);
     tl_framework_destroy(framework);
-    tl_source_destroy(dem);
+    command_close(&opened);
     return status;
 }
 
@@ -108,25 +109,27 @@ static int run(const command *self, int argc, const char **argv, bool help)
         {"frame", 0, OPTION_CHOICE, &set.frame, NULL, "FRAME",
          "coordinates of the mesh (default: enu where the CRS is known)", 0, 0, frames},
         {0}};
+    const option input[] = {COMMON_INPUT(set.common), {0}};
     const option output[] = {COMMON_OUTPUT(set.common), {0}};
     const option running[] = {COMMON_RUNNING(set.common), {0}};
-    const option_group groups[] = {{"Simplification", shape}, {"Output", output}, {"Running", running}, {0}};
+    const option_group groups[] = {
+        {"Simplification", shape}, {"Input", input}, {"Output", output}, {"Running", running}, {0}};
     arguments rest;
     int status;
-    if (!command_begin(self, argc, argv, help, groups, 1, &rest, &status))
+    if (!command_begin(self, argc, argv, help, groups, -1, &rest, &status))
         return status;
     if (!set.max_error_given) {
         complain("no error bound given; give --max-error E, in the DEM's unit of height");
         status = EXIT_USAGE;
     } else
-        status = command_output_ok(&set.common, false, true) ? simplify(&set, rest.names[0]) : EXIT_USAGE;
+        status = command_output_ok(&set.common, false, true) ? simplify(&set, &rest) : EXIT_USAGE;
     arguments_free(&rest);
     return status;
 }
 
 const command command_simplify = {
-    "simplify", "simplify an elevation model to a mesh under a strict error bound", "DEM --max-error E -o MESH",
+    "simplify", "simplify an elevation model to a mesh under a strict error bound", "DEM... --max-error E -o MESH",
     "Formats: .glb, .obj, .ply. Frames: enu is metres east, north and up of the raster's middle;\n"
-    "projected is the DEM's own coordinates; pixel is column, row, height.\n\n"
+    "projected is the DEM's own coordinates; pixel is column, row, height.\n\n" INPUT_NOTES "\n\n"
     "Example: talus simplify dem.tif --max-error 5 --verify -o mesh.glb",
     run};

@@ -52,7 +52,8 @@ static int synth(settings *set, const arguments *inputs)
     progress bar;
     tl_error error;
     tl_run run = command_run(&set->common, &bar);
-    tl_source *dem = command_open(&set->common, inputs, &run, &error);
+    opened_input opened = command_open(&set->common, inputs, &run, &error);
+    const tl_source *dem = opened.source;
     if (!dem)
         return command_failed(&bar, &error);
     progress_stage(&bar, "measuring");
@@ -60,7 +61,7 @@ static int synth(settings *set, const arguments *inputs)
     tl_source *field = tl_field_create(dem, &set->field, &error);
     int status = field ? write_out(set, field, &run, &bar) : command_failed(&bar, &error);
     tl_source_destroy(field);
-    tl_source_destroy(dem);
+    command_close(&opened);
     return status;
 }
 

@@ -1,9 +1,11 @@
 #include "cmd/command.h"
 
 #include <errno.h>
+#include <math.h>
 #include <stdarg.h>
 #include <stdint.h>
 #include <stdio.h>
+#include <stdlib.h>
 #include <string.h>
 
 const char *const progress_names[] = {
@@ -56,14 +58,57 @@ tl_run command_run(const common *options, progress *bar)
                         (unsigned)options->threads);
 }
 
-tl_source *command_open(const common *options, const arguments *inputs, const tl_run *run, tl_error *error)
+static tl_source *open_files(const common *options, const arguments *inputs, const tl_run *quietly, tl_error *error)
+{
+    const tl_dem_options dem = {.band = (unsigned)options->band, .feather = options->feather, .run = quietly};
+    if (inputs->count == 1 && !options->feather && !options->band)
+        return tl_open(inputs->names[0], error);
+    return tl_dem_open((const char *const *)inputs->names, inputs->count, &dem, error);
+}
+
+/* Whether --voids is understood. */
+static bool void_options(const common *options, const tl_run *run, tl_void_options *out, tl_error *error)
+{
+    *out = (tl_void_options){.nodata_given = options->nodata_given, .nodata = (float)options->nodata, .run = run};
+    const char *rule = options->voids;
+    if (!rule || strcmp(rule, "keep") == 0)
+        return true;
+    if (strcmp(rule, "fill") == 0) {
+        out->rule = TL_VOIDS_FILL;
+        return true;
+    }
+    char *end;
+    out->rule = TL_VOIDS_VALUE;
+    out->value = strtof(rule, &end);
+    if (end != rule && !*end && isfinite(out->value))
+        return true;
+    error->status = TL_ERROR_ARGUMENT;
+    snprintf(error->text, sizeof error->text, "--voids: keep, fill or a height is wanted, not '%.100s'", rule);
+    return false;
+}
+
+opened_input command_open(const common *options, const arguments *inputs, const tl_run *run, tl_error *error)
 {
     /* opening has no progress to speak of */
     const tl_run quietly = {.threads = run->threads, .cancel = run->cancel};
-    const tl_dem_options dem = {.feather = options->feather, .run = &quietly};
-    if (inputs->count == 1 && !options->feather)
-        return tl_open(inputs->names[0], error);
-    return tl_dem_open((const char *const *)inputs->names, inputs->count, &dem, error);
+    tl_void_options voids;
+    opened_input opened = {0};
+    if (void_options(options, run, &voids, error))
+        opened.file = open_files(options, inputs, &quietly, error);
+    opened.source = opened.file;
+    if (opened.file && (voids.rule != TL_VOIDS_KEEP || voids.nodata_given))
+        opened.source = tl_voids_create(opened.file, &voids, error);
+    if (!opened.source)
+        command_close(&opened);
+    return opened;
+}
+
+void command_close(opened_input *opened)
+{
+    if (opened->source != opened->file)
+        tl_source_destroy(opened->source);
+    tl_source_destroy(opened->file);
+    *opened = (opened_input){0};
 }
 
 int command_failed(progress *bar, const tl_error *error)

@@ -21,16 +21,42 @@ extern const command command_info, command_simplify, command_synth, command_prev
 typedef struct common {
     const char *output;
     bool overwrite, quiet, feather;
+    const char *voids; /* keep, fill or a number */
+    double nodata;
+    bool nodata_given;
+    int64_t band; /* 0: the first */
     int64_t threads;
     int progress; /* index into the names of progress_style */
 } common;
 
 /* The rows of the options in a `common`, for use inside of an array of options. */
-#define COMMON_INPUT(c)                                                                                            \
-    {                                                                                                              \
-        "feather", 0, OPTION_FLAG, &(c).feather, NULL, NULL,                                                       \
-            "blend files where they overlap, over at most 32 samples (default: the finest, then the first)", 0, 0, \
-            NULL                                                                                                   \
+#define COMMON_INPUT(c)                                                                                               \
+    {"band", 0,   OPTION_INTEGER, &(c).band, NULL, "N", "the band that holds the heights, 1...65535 (default: 1)", 1, \
+     65535,  NULL},                                                                                                   \
+        {"nodata",                                                                                                    \
+         0,                                                                                                           \
+         OPTION_NUMBER,                                                                                               \
+         &(c).nodata,                                                                                                 \
+         &(c).nodata_given,                                                                                           \
+         "VALUE",                                                                                                     \
+         "a height that stands for void, besides what the file declares",                                             \
+         -3.5e38,                                                                                                     \
+         3.5e38,                                                                                                      \
+         NULL},                                                                                                       \
+        {"voids",                                                                                                     \
+         0,                                                                                                           \
+         OPTION_TEXT,                                                                                                 \
+         &(c).voids,                                                                                                  \
+         NULL,                                                                                                        \
+         "RULE",                                                                                                      \
+         "keep; fill, by a smooth surface from the rim; or a height for all (default: keep)",                         \
+         0,                                                                                                           \
+         0,                                                                                                           \
+         NULL},                                                                                                       \
+    {                                                                                                                 \
+        "feather", 0, OPTION_FLAG, &(c).feather, NULL, NULL,                                                          \
+            "blend files where they overlap, over at most 32 samples (default: the finest, then the first)", 0, 0,    \
+            NULL                                                                                                      \
     }
 #define COMMON_OUTPUT(c)                                                                                       \
     {"output", 'o', OPTION_TEXT, &(c).output, NULL, "FILE", "where to write; the ending chooses the format",   \
@@ -64,8 +90,15 @@ bool command_begin(const command *self, int argc, const char **argv, bool help, 
 
 /* The tl_run of a command; reports to *bar. */
 tl_run command_run(const common *options, progress *bar);
+/* What a command reads: files, and what --voids and --nodata make of them. */
+typedef struct opened_input {
+    tl_source *source; /* to be used; NULL: could not be opened */
+    tl_source *file;
+} opened_input;
+
 /* Opens the inputs as one source: an EXR, or elevation models. */
-tl_source *command_open(const common *options, const arguments *inputs, const tl_run *run, tl_error *error);
+opened_input command_open(const common *options, const arguments *inputs, const tl_run *run, tl_error *error);
+void command_close(opened_input *opened);
 /* What COMMAND's help says of its inputs. */
 #define INPUT_NOTES                                                                                                 \
     "Inputs are GeoTIFFs, SRTM .hgt files, directories of them, patterns or @LIST (a file of names); several make " \

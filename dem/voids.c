@@ -25,14 +25,24 @@ typedef struct group {
 typedef struct void_source {
     tl_source source;
     const tl_source *original;
-    tl_void_rule rule;
-    float value;
+    tl_void_options options;
     int64_t columns, rows; /* of blocks */
     float **filled; /* by block; NULL: nothing filled there. [BLOCK * BLOCK] heights, NaN where the source has one */
     tl_parameter *parameters;
 } void_source;
 
 /* ---- reading ---- */
+
+/* The original's heights, with what is declared here as nodata made void. */
+static tl_status read_original(const void_source *v, int level, tl_window window, float *out, tl_error *error)
+{
+    tl_status status = tl_source_read(v->original, level, window, out, error);
+    if (status == TL_OK && v->options.nodata_given)
+        for (int64_t k = 0; k < window.width * window.height; k++)
+            if (out[k] == v->options.nodata)
+                out[k] = NAN;
+    return status;
+}
 
 static const float *block_at(const void_source *v, int64_t x, int64_t y)
 {
@@ -42,8 +52,8 @@ static const float *block_at(const void_source *v, int64_t x, int64_t y)
 /* The height that stands for the void at (x, y); NaN where it stays one. */
 static float fill_at(const void_source *v, int64_t x, int64_t y)
 {
-    if (v->rule == TL_VOIDS_VALUE)
-        return v->value;
+    if (v->options.rule == TL_VOIDS_VALUE)
+        return v->options.value;
     const float *block = block_at(v, x, y);
     return block ? block[y % BLOCK * BLOCK + x % BLOCK] : NAN;
 }
@@ -51,10 +61,25 @@ static float fill_at(const void_source *v, int64_t x, int64_t y)
 static tl_status void_read(const tl_source *self, int level, tl_window window, float *out, tl_error *error)
 {
     const void_source *v = (const void_source *)self;
-    tl_status status = tl_source_read(v->original, level, window, out, error);
+    tl_status status = read_original(v, level, window, out, error);
     for (int64_t k = 0; status == TL_OK && k < window.width * window.height; k++)
         if (isnan(out[k]))
             out[k] = fill_at(v, window.x + k % window.width, window.y + k / window.width);
+    return status;
+}
+
+/* Marks as void what is declared here as nodata. */
+static tl_status drop_nodata(const void_source *v, int level, tl_window window, unsigned char *validity,
+                             tl_error *error)
+{
+    float *heights = tl_alloc_grid(window.width, window.height, sizeof *heights);
+    if (!heights)
+        return tl_fail_memory(error, v->source.info.name);
+    tl_status status = read_original(v, level, window, heights, error);
+    for (int64_t k = 0; status == TL_OK && k < window.width * window.height; k++)
+        if (isnan(heights[k]))
+            validity[k] = TL_VOID;
+    free(heights);
     return status;
 }
 
@@ -62,6 +87,8 @@ static tl_status void_validity(const tl_source *self, int level, tl_window windo
 {
     const void_source *v = (const void_source *)self;
     tl_status status = tl_source_validity(v->original, level, window, out, error);
+    if (status == TL_OK && v->options.nodata_given)
+        status = drop_nodata(v, level, window, out, error);
     for (int64_t k = 0; status == TL_OK && k < window.width * window.height; k++)
         if (out[k] == TL_VOID && !isnan(fill_at(v, window.x + k % window.width, window.y + k / window.width)))
             out[k] = TL_FILLED;
@@ -110,7 +137,7 @@ static tl_status scan_blocks(void *context, tl_parallel *loop, uint64_t item, un
     float *heights = tl_alloc_grid(window.width, window.height, sizeof *heights);
     if (!heights)
         return tl_fail_memory(error, info->name);
-    tl_status status = tl_source_read(s->v->original, info->level, window, heights, error);
+    tl_status status = read_original(s->v, info->level, window, heights, error);
     if (status == TL_OK)
         look_at(s, window, heights);
     free(heights);
@@ -254,7 +281,7 @@ static tl_status read_box(const void_source *v, tl_window box, float *out, tl_er
     for (int64_t y = 0; y < box.height;
          y += BLOCK) { /* by bands, so that the reader's cache is not asked for a whole raster */
         tl_window band = {box.x, box.y + y, box.width, tl_int64_min(BLOCK, box.height - y)};
-        tl_status status = tl_source_read(v->original, v->source.info.level, band, out + y * box.width, error);
+        tl_status status = read_original(v, v->source.info.level, band, out + y * box.width, error);
         if (status != TL_OK)
             return status;
     }
@@ -352,16 +379,19 @@ static tl_status fill(void_source *v, const tl_run *run, tl_error *error)
     return status;
 }
 
-static tl_status note_rule(void_source *v, tl_error *error)
+static tl_status note_options(void_source *v, tl_error *error)
 {
     tl_source_info *info = &v->source.info;
-    char text[TL_NUMBER_TEXT] = "filled";
-    if (v->rule == TL_VOIDS_VALUE)
-        tl_number_text((double)v->value, text);
+    char number[TL_NUMBER_TEXT];
     v->parameters = tl_parameters_copy(info->parameters, info->parameter_count);
-    if (info->parameter_count && !v->parameters)
-        return tl_fail_memory(error, info->name);
-    tl_status status = tl_parameters_add(&v->parameters, &info->parameter_count, "voids", text, error);
+    tl_status status = info->parameter_count && !v->parameters ? tl_fail_memory(error, info->name) : TL_OK;
+    tl_number_text((double)v->options.nodata, number);
+    if (status == TL_OK && v->options.nodata_given)
+        status = tl_parameters_add(&v->parameters, &info->parameter_count, "nodata", number, error);
+    tl_number_text((double)v->options.value, number);
+    if (status == TL_OK && v->options.rule != TL_VOIDS_KEEP)
+        status = tl_parameters_add(&v->parameters, &info->parameter_count, "voids",
+                                   v->options.rule == TL_VOIDS_FILL ? "fill" : number, error);
     info->parameters = v->parameters;
     return status;
 }
@@ -388,15 +418,13 @@ tl_source *tl_voids_create(const tl_source *source, const tl_void_options *optio
     *v = (void_source){
         .source = {.info = source->info, .read = void_read, .validity = void_validity, .destroy = void_destroy},
         .original = source,
-        .rule = o->rule,
-        .value = o->value,
+        .options = *o,
         .columns = columns,
         .rows = rows};
-    tl_status status = o->rule == TL_VOIDS_KEEP ? TL_OK : note_rule(v, error);
+    v->source.info.has_voids = o->rule != TL_VOIDS_VALUE && (source->info.has_voids || o->nodata_given);
+    tl_status status = note_options(v, error);
     if (status == TL_OK && o->rule == TL_VOIDS_FILL)
         status = fill(v, o->run, error);
-    if (o->rule == TL_VOIDS_VALUE)
-        v->source.info.has_voids = false;
     if (status == TL_OK)
         return &v->source;
     void_destroy(&v->source);

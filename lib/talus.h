@@ -249,6 +249,8 @@ typedef enum tl_void_rule {
 } tl_void_rule;
 
 typedef struct tl_void_options {
+    bool nodata_given; /* heights equal to `nodata` count as voids too: for files that do not declare it */
+    float nodata;
     tl_void_rule rule;
     float value;       /* for TL_VOIDS_VALUE; finite */
     const tl_run *run; /* filling reads the source once, and the surroundings of its voids twice */

@@ -1,5 +1,5 @@
 #!/bin/sh
-# Installs what is missing, builds talus twice (release; address and undefined sanitizers) and runs every suite in both;
+# Installs what is missing, builds talus three times (release; address and undefined sanitizers; without SIMD) and runs every suite in both;
 # checks warnings with clang, the layers, the format and the public header. Ends with "N passed, N failed".
 #   tests/run.sh [FOLDER]    (default: build-tests beside the sources)
 set -eu

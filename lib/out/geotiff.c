@@ -192,8 +192,7 @@ static bool set_directory(TIFF *tiff, const tl_source_info *info, bool compress)
         good = TIFFSetField(tiff, GDAL_NODATA, "nan") == 1;
     if (good && info->georef.located)
         good = set_transform(tiff, info);
-    if (good && (info->georef.located || info->georef.crs))
-        good = set_keys(tiff, info);
+    good = good && set_keys(tiff, info); /* also without a place: the raster type is a key */
     return good && (info->parameter_count == 0 || set_metadata(tiff, info));
 }
 
