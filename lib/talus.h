@@ -357,7 +357,9 @@ TL_API tl_source *tl_field_create(const tl_source *dem, const tl_field_options *
 typedef struct tl_roughness {
     bool measurable; /* false: too small, too flat or too void to tell; the rest is then 0 */
     double sigma;    /* standard deviation of the detail of the finest octave, units of height */
-    double hurst;    /* exponent between the two finest octaves; above 1 on smooth hillslopes */
+    /* Exponent between the two finest octaves; above 1 on smooth hillslopes. The second octave is that of 2 x 2 means,
+     * as suits rasters of cell means; of a surface sampled at true points it reads some 0.3 to 0.6 too low. */
+    double hurst;
 } tl_roughness;
 
 TL_API tl_status tl_roughness_measure(const tl_source *dem, const tl_run *run, tl_roughness *out, tl_error *error);
@@ -438,7 +440,7 @@ typedef struct tl_preview_options {
 } tl_preview_options;
 
 /* Draws a source as a PNG: hillshade from above, with north at the top and as many metres a pixel both ways, or a
- * perspective, by default as a model with walls around it. Voids are transparent (in a perspective one sees through
+ * perspective, as a model with walls around it. Voids are transparent (in a perspective one sees through
  * them). If both width and height are asked for, what the raster does not fill is transparent too.
  * `beside` may name a second source, drawn to the right of the first with the same colours on the same ground (by
  * coordinates if both have the same CRS, else both cover the same); hillshade only. The finer of the two is then shown

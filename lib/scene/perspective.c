@@ -36,7 +36,6 @@ typedef struct scene {
     scene_palette palette;
     scene_light light;
     double low, high; /* of all ground, exaggerated metres */
-    bool walls;       /* sides down to `foot`, as of a model */
     double foot;
     double near_plane, haze; /* metres; at the latter half of the light is lost; 0: clear air */
     tile *tiles;             /* front to back */
@@ -74,7 +73,7 @@ static bool tile_box(const scene *s, scene_tile_id id, scene_box *box)
     box->low[2] = fmax(box->low[2] - reach, s->low);
     box->high[2] = fmin(box->high[2] + reach, s->high);
     bool side = x0 == 0 || y0 == 0 || x1 == info->width - 1 || y1 == info->height - 1;
-    if (s->walls && (side || info->has_voids))
+    if (side || info->has_voids) /* walls */
         box->low[2] = s->foot;
     return bounds.low <= bounds.high;
 }
@@ -438,7 +437,7 @@ static void draw_tile(const scene *s, easel *e, const tile *t)
         for (int i = 1; i <= columns; i++)
             draw_cell(e, j * SCENE_GRID + i);
     draw_skirts(s, e, t->id, columns, rows);
-    if (s->walls && has_rim(e, columns, rows))
+    if (has_rim(e, columns, rows))
         draw_walls(s, e, t->id, columns, rows);
 }
 
@@ -458,7 +457,7 @@ static scene_rgb sky(const scene *s, double x, double y)
     double a = x / c->focal, b = y / c->focal;
     float sine = (float)(up / sqrt(1 + a * a + b * b));
     const scene_rgb horizon = {0.72f, 0.79f, 0.86f}, zenith = {0.20f, 0.36f, 0.62f}, below = {0.56f, 0.61f, 0.66f};
-    return sine > 0 ? scene_mix(horizon, zenith, sqrtf(sine) * (1.2f - 0.2f * sine)) : scene_mix(horizon, below, -sine);
+    return sine > 0 ? scene_mix(horizon, zenith, sine * (2 - sine)) : scene_mix(horizon, below, -sine);
 }
 
 static scene_rgb fragment_colour(const scene *s, const scene_fragment *f, double x, double y)
@@ -638,7 +637,6 @@ static tl_status prepare(scene *s, const tl_preview_options *o, tl_error *error)
     measure(s, &box);
     if (!(s->low <= s->high))
         return tl_fail(error, TL_ERROR_DATA, "%s: has no valid heights, so there is nothing to look at", info->name);
-    s->walls = !o->view_given;
     if (o->view_given)
         s->haze = 1.8 * hypot(box.high[0] - box.low[0], box.high[1] - box.low[1]);
     tl_status status = place_camera(s, o, exaggeration, &box, error);
