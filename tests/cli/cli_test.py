@@ -43,6 +43,11 @@ def prepare(case):
     write_tiff(case.path("nodata.tif"), 6, 5, [-9999.0] * 30, point=False, nodata="-9999", **utm)
     write_tiff(case.path("one.tif"), 1, 1, [5.0], point=False, **utm)
     write_tiff(case.path("row.tif"), 20, 1, wave[:20], point=False, **utm)
+    write_tiff(case.path("east.tif"), 20, 15, wave, point=False, epsg=32611, origin=(400600, 3800000), cell=(30, 30))
+    write_tiff(case.path("coarse.tif"), 20, 15, wave, point=False, epsg=32611, origin=(400000, 3799550), cell=(60, 60))
+    write_tiff(case.path("zone12.tif"), 20, 15, wave, point=False, **{**utm, "epsg": 32612})
+    with open(case.path("tiles.txt"), "w", encoding="utf-8") as file:
+        file.write("# two tiles\narea.tif\neast.tif\n")
 
 
 def normalise(printed, case, version):
