@@ -3,12 +3,6 @@
 #include <stdio.h>
 #include <sys/stat.h>
 
-static const char *const frames[] = {[TL_FRAME_DEFAULT] = "default",
-                                     [TL_FRAME_ENU] = "enu",
-                                     [TL_FRAME_PROJECTED] = "projected",
-                                     [TL_FRAME_PIXEL] = "pixel",
-                                     NULL};
-
 typedef struct settings {
     common common;
     double max_error;
@@ -107,7 +101,7 @@ static int run(const command *self, int argc, const char **argv, bool help)
         {"verify", 0, OPTION_FLAG, &set.verify, NULL, NULL, "measure the finished mesh against every sample", 0, 0,
          NULL},
         {"frame", 0, OPTION_CHOICE, &set.frame, NULL, "FRAME",
-         "coordinates of the mesh (default: enu where the CRS is known)", 0, 0, frames},
+         "coordinates of the mesh (default: enu where the CRS is known)", 0, 0, frame_names},
         {0}};
     const option input[] = {COMMON_INPUT(set.common), {0}};
     const option output[] = {COMMON_OUTPUT(set.common), {0}};

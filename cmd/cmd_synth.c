@@ -6,12 +6,6 @@
 static const char *const compressions[] = {
     [TL_COMPRESSION_DEFAULT] = "default", [TL_COMPRESSION_NONE] = "none", [TL_COMPRESSION_ZIP] = "zip",
     [TL_COMPRESSION_ZIPS] = "zips",       [TL_COMPRESSION_PIZ] = "piz",   NULL};
-static const char *const frames[] = {[TL_FRAME_DEFAULT] = "default",
-                                     [TL_FRAME_ENU] = "enu",
-                                     [TL_FRAME_PROJECTED] = "projected",
-                                     [TL_FRAME_PIXEL] = "pixel",
-                                     NULL};
-
 typedef struct settings {
     common common;
     tl_field_options field;
@@ -105,7 +99,7 @@ static int run_synth(const command *self, int argc, const char **argv, bool help
                              {"compression", 0, OPTION_CHOICE, &set.compression, NULL, "KIND",
                               "of .exr and .tif (default: zip)", 0, 0, compressions},
                              {"frame", 0, OPTION_CHOICE, &set.frame, NULL, "FRAME",
-                              "coordinates of a mesh (default: enu where the CRS is known)", 0, 0, frames},
+                              "coordinates of a mesh (default: enu where the CRS is known)", 0, 0, frame_names},
                              {0}};
     const option running[] = {COMMON_RUNNING(set.common), {0}};
     const option_group groups[] = {{"Detail", detail}, {"Input", input}, {"Output", output}, {"Running", running}, {0}};

@@ -11,6 +11,12 @@
 const char *const progress_names[] = {
     [PROGRESS_BAR] = "bar", [PROGRESS_JSON] = "json", [PROGRESS_NONE] = "none", [PROGRESS_NONE + 1] = NULL};
 
+const char *const frame_names[] = {[TL_FRAME_DEFAULT] = "default",
+                                   [TL_FRAME_ENU] = "enu",
+                                   [TL_FRAME_PROJECTED] = "projected",
+                                   [TL_FRAME_PIXEL] = "pixel",
+                                   NULL};
+
 static void print_help(const command *self, const option_group *groups)
 {
     printf("talus %s: %s\n\nUsage: talus %s %s\n", self->name, self->summary, self->name, self->arguments);

@@ -81,7 +81,7 @@ typedef struct common {
         "quiet", 'q', OPTION_FLAG, &(c).quiet, NULL, NULL, "print nothing but errors and data", 0, 0, NULL             \
     }
 
-extern const char *const progress_names[];
+extern const char *const progress_names[], *const frame_names[]; /* by progress_style and tl_frame, ended by NULL */
 
 /* Parses the command's options and checks that `inputs` file names stand beside them (-1: one or more). False: the
  * caller ends with *status. */
