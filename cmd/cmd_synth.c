@@ -30,6 +30,7 @@ static int write_out(const settings *set, const tl_source *made, const tl_run *r
     tl_error error;
     progress_stage(bar, "synthesis");
     tl_write_options options = {.overwrite = set->common.overwrite,
+                                .validity = set->common.voids && strcmp(set->common.voids, "keep") != 0,
                                 .compression = (tl_compression)set->compression,
                                 .frame = (tl_frame)set->frame,
                                 .run = run};

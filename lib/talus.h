@@ -407,6 +407,7 @@ typedef enum tl_compression {
 
 typedef struct tl_write_options {
     bool overwrite; /* replace an existing file; else TL_ERROR_IO */
+    bool validity;  /* of grids, not meshes: also write each sample's tl_validity, to NAME.validity.tif for NAME.exr */
     tl_compression compression;
     tl_frame frame;
     const tl_run *run;

@@ -263,6 +263,30 @@ static void picturesHaveTheNorthOnTop(void **state)
     tl_source_destroy(back);
 }
 
+static void validityTravelsBesideTheHeights(void **state)
+{
+    place *p = *state;
+    const char *const names[] = {"a.exr", "a.tif", "a.png"};
+    for (size_t k = 0; k < 3; k++)
+        for (int rows = 0; rows < 2; rows++) {
+            p->source->info.georef.transform[5] = rows ? 30 : -30;
+            tl_source *filled = tl_voids_create(p->source, &(tl_void_options){.rule = TL_VOIDS_FILL}, NULL);
+            write_ok(filled, in_folder(p, names[k]), &(tl_write_options){.validity = true, .overwrite = true});
+            tl_source *back = open_ok(in_folder(p, "a.validity.tif"));
+            float *read = tl_alloc_grid(WIDTH, HEIGHT, sizeof *read);
+            assert_int_equal(tl_source_read(back, 0, (tl_window){0, 0, WIDTH, HEIGHT}, read, NULL), TL_OK);
+            bool turned = rows && k != 1; /* GeoTIFF keeps the source's order of rows */
+            for (int n = 0; n < WIDTH * HEIGHT; n++) {
+                int from = turned ? (HEIGHT - 1 - n / WIDTH) * WIDTH + n % WIDTH : n;
+                assert_true(read[n] == (isnan(p->heights[from]) ? TL_FILLED : TL_MEASURED));
+            }
+            assert_near(back->info.georef.transform[5], turned ? -30 : p->source->info.georef.transform[5], 0);
+            free(read);
+            tl_source_destroy(back);
+            tl_source_destroy(filled);
+        }
+}
+
 static void png16IsWithinHalfAStep(void **state)
 {
     place *p = *state;
@@ -552,6 +576,7 @@ int main(void)
         cmocka_unit_test_setup_teardown(geotiffKeepsRotatedAndMirroredGrids, setUp, tearDown),
         cmocka_unit_test_setup_teardown(unlocatedRastersStayUnlocated, setUp, tearDown),
         cmocka_unit_test_setup_teardown(picturesHaveTheNorthOnTop, setUp, tearDown),
+        cmocka_unit_test_setup_teardown(validityTravelsBesideTheHeights, setUp, tearDown),
         cmocka_unit_test_setup_teardown(png16IsWithinHalfAStep, setUp, tearDown),
         cmocka_unit_test_setup_teardown(constantAndVoidGridsAreWritten, setUp, tearDown),
         cmocka_unit_test_setup_teardown(threadsDoNotChangeTheBytes, setUp, tearDown),

@@ -4,6 +4,7 @@
 
 #include <assert.h>
 #include <fcntl.h>
+#include <stdlib.h>
 #include <string.h>
 #include <strings.h>
 #include <unistd.h>
@@ -117,6 +118,36 @@ static tl_status write_rows(const struct writers *format, const tl_source *sourc
     return finish(output, format->grid(source, output, options, error), error);
 }
 
+/* "x.exr" to "x.validity.tif". */
+static char *validity_path(const char *path)
+{
+    static const char ending[] = ".validity.tif";
+    size_t stem = (size_t)(strrchr(path, '.') - path);
+    char *result = malloc(stem + sizeof ending);
+    if (result) {
+        memcpy(result, path, stem);
+        memcpy(result + stem, ending, sizeof ending);
+    }
+    return result;
+}
+
+/* The heights, and beside them their validity, which gets its name when the heights have theirs. */
+static tl_status write_with_validity(const struct writers *format, const tl_source *source, const char *path,
+                                     const tl_write_options *options, tl_error *error)
+{
+    char *beside = validity_path(path);
+    tl_output *output = beside ? tl_output_open(beside, options->overwrite, error) : NULL;
+    tl_status status = beside ? TL_ERROR_IO : tl_fail_memory(error, path);
+    if (output)
+        status = out_validity_write(source, output, options, error);
+    if (status == TL_OK)
+        status = write_rows(format, source, path, options, error);
+    if (output)
+        status = finish(output, status, error);
+    free(beside);
+    return status;
+}
+
 tl_status tl_write_grid(const tl_source *source, const char *path, const tl_write_options *options, tl_error *error)
 {
     options = options ? options : &defaults;
@@ -125,10 +156,11 @@ tl_status tl_write_grid(const tl_source *source, const char *path, const tl_writ
         return TL_ERROR_ARGUMENT;
     if (format->mesh)
         return write_as_mesh(source, path, options, error);
-    if (!format->picture)
-        return write_rows(format, source, path, options, error);
-    tl_source *upright = scene_north_up(source, error);
-    tl_status status = upright ? write_rows(format, upright, path, options, error) : TL_ERROR_MEMORY;
+    tl_source *upright = format->picture ? scene_north_up(source, error) : NULL;
+    if (format->picture && !upright)
+        return TL_ERROR_MEMORY;
+    tl_status status = (options->validity ? write_with_validity : write_rows)(format, upright ? upright : source, path,
+                                                                              options, error);
     tl_source_destroy(upright);
     return status;
 }

@@ -1,5 +1,5 @@
-/* GeoTIFF: tiled float32 with deflate and the floating-point predictor. libtiff keeps the directory; tiles are
- * predicted and compressed here, in parallel, and handed to it in order. */
+/* GeoTIFF: tiled, float32 with deflate and the floating-point predictor, or bytes of validity. libtiff keeps the
+ * directory; tiles are predicted and compressed here, in parallel, and handed to it in order. */
 #include "dem/crs.h"
 #include "lib/base/error.h"
 #include "lib/base/parallel.h"
@@ -174,21 +174,26 @@ static bool set_transform(TIFF *tiff, const tl_source_info *info)
     return TIFFSetField(tiff, TIFFTAG_GEOTRANSMATRIX, 16, matrix) == 1;
 }
 
-static bool set_directory(TIFF *tiff, const tl_source_info *info, bool compress)
+static bool set_sample_format(TIFF *tiff, bool validity)
+{
+    return TIFFSetField(tiff, TIFFTAG_BITSPERSAMPLE, validity ? 8 : 32) == 1 &&
+           TIFFSetField(tiff, TIFFTAG_SAMPLEFORMAT, validity ? SAMPLEFORMAT_UINT : SAMPLEFORMAT_IEEEFP) == 1;
+}
+
+static bool set_directory(TIFF *tiff, const tl_source_info *info, bool compress, bool validity)
 {
     define_gdal_tags(tiff);
-    bool good =
-        TIFFSetField(tiff, TIFFTAG_IMAGEWIDTH, (uint32_t)info->width) == 1 &&
-        TIFFSetField(tiff, TIFFTAG_IMAGELENGTH, (uint32_t)info->height) == 1 &&
-        TIFFSetField(tiff, TIFFTAG_TILEWIDTH, OUT_TILE) == 1 && TIFFSetField(tiff, TIFFTAG_TILELENGTH, OUT_TILE) == 1 &&
-        TIFFSetField(tiff, TIFFTAG_SAMPLESPERPIXEL, 1) == 1 && TIFFSetField(tiff, TIFFTAG_BITSPERSAMPLE, 32) == 1 &&
-        TIFFSetField(tiff, TIFFTAG_SAMPLEFORMAT, SAMPLEFORMAT_IEEEFP) == 1 &&
-        TIFFSetField(tiff, TIFFTAG_PLANARCONFIG, PLANARCONFIG_CONTIG) == 1 &&
-        TIFFSetField(tiff, TIFFTAG_PHOTOMETRIC, PHOTOMETRIC_MINISBLACK) == 1 &&
-        TIFFSetField(tiff, TIFFTAG_COMPRESSION, compress ? COMPRESSION_ADOBE_DEFLATE : COMPRESSION_NONE) == 1;
-    if (good && compress)
+    bool good = TIFFSetField(tiff, TIFFTAG_IMAGEWIDTH, (uint32_t)info->width) == 1 &&
+                TIFFSetField(tiff, TIFFTAG_IMAGELENGTH, (uint32_t)info->height) == 1 &&
+                TIFFSetField(tiff, TIFFTAG_TILEWIDTH, OUT_TILE) == 1 &&
+                TIFFSetField(tiff, TIFFTAG_TILELENGTH, OUT_TILE) == 1 &&
+                TIFFSetField(tiff, TIFFTAG_SAMPLESPERPIXEL, 1) == 1 && set_sample_format(tiff, validity) &&
+                TIFFSetField(tiff, TIFFTAG_PLANARCONFIG, PLANARCONFIG_CONTIG) == 1 &&
+                TIFFSetField(tiff, TIFFTAG_PHOTOMETRIC, PHOTOMETRIC_MINISBLACK) == 1 &&
+                TIFFSetField(tiff, TIFFTAG_COMPRESSION, compress ? COMPRESSION_ADOBE_DEFLATE : COMPRESSION_NONE) == 1;
+    if (good && compress && !validity)
         good = TIFFSetField(tiff, TIFFTAG_PREDICTOR, PREDICTOR_FLOATINGPOINT) == 1;
-    if (good && info->has_voids)
+    if (good && info->has_voids && !validity)
         good = TIFFSetField(tiff, GDAL_NODATA, "nan") == 1;
     if (good && info->georef.located)
         good = set_transform(tiff, info);
@@ -215,20 +220,21 @@ static void predict_rows(const float *heights, unsigned char *out)
 }
 
 /* Spreads the rows of a narrower window over a whole tile, the last column and row repeated: what compresses best. */
-static void pad_tile(float *heights, tl_window window)
+static void pad_tile(unsigned char *samples, size_t size, tl_window window)
 {
+    size_t width = (size_t)window.width * size, stride = OUT_TILE * size;
     for (int64_t row = window.height - 1; row >= 0; row--) {
-        float *to = heights + row * OUT_TILE;
-        memmove(to, heights + row * window.width, (size_t)window.width * sizeof *to);
-        for (int64_t i = window.width; i < OUT_TILE; i++)
-            to[i] = to[window.width - 1];
+        unsigned char *to = samples + (size_t)row * stride;
+        memmove(to, samples + (size_t)row * width, width);
+        for (size_t at = width; at < stride; at += size)
+            memcpy(to + at, to + width - size, size);
     }
     for (int64_t row = window.height; row < OUT_TILE; row++)
-        memcpy(heights + row * OUT_TILE, heights + (window.height - 1) * OUT_TILE, OUT_TILE * sizeof *heights);
+        memcpy(samples + (size_t)row * stride, samples + (size_t)(window.height - 1) * stride, stride);
 }
 
 typedef struct worker {
-    float *heights;
+    void *samples; /* floats, or bytes of validity */
     unsigned char *predicted, *packed;
     struct libdeflate_compressor *compressor;
 } worker;
@@ -238,7 +244,7 @@ typedef struct writing {
     const char *path;
     TIFF *tiff;
     out_tiling tiling;
-    bool compress;
+    bool compress, validity;
     size_t packed_limit;
     worker *workers;
     complaint said;
@@ -246,42 +252,60 @@ typedef struct writing {
 
 static bool worker_init(worker *self, const writing *w)
 {
-    self->heights = malloc(TILE_BYTES);
+    self->samples = malloc(TILE_BYTES);
     self->predicted = w->compress ? malloc(TILE_BYTES) : NULL;
     self->packed = w->compress ? malloc(w->packed_limit) : NULL;
     self->compressor = w->compress ? libdeflate_alloc_compressor(DEFLATE_LEVEL) : NULL;
-    return self->heights && (!w->compress || (self->predicted && self->packed && self->compressor));
+    return self->samples && (!w->compress || (self->predicted && self->packed && self->compressor));
 }
 
 static void worker_finish(worker *self)
 {
-    free(self->heights);
+    free(self->samples);
     free(self->predicted);
     free(self->packed);
     if (self->compressor)
         libdeflate_free_compressor(self->compressor);
 }
 
+static tl_status read_tile(const writing *w, worker *self, tl_window window, tl_error *error)
+{
+    int level = w->source->info.level;
+    tl_status status = w->validity ? tl_source_validity(w->source, level, window, self->samples, error)
+                                   : tl_source_read(w->source, level, window, self->samples, error);
+    if (status == TL_OK)
+        pad_tile(self->samples, w->validity ? 1 : sizeof(float), window);
+    return status;
+}
+
+/* The bytes that the file holds for the tile, and how many. */
+static const void *pack_tile(const writing *w, worker *self, size_t *count)
+{
+    const void *bytes = self->samples;
+    *count = w->validity ? OUT_TILE * OUT_TILE : TILE_BYTES;
+    if (!w->compress)
+        return bytes;
+    if (!w->validity) {
+        predict_rows(self->samples, self->predicted);
+        bytes = self->predicted;
+    }
+    *count = libdeflate_zlib_compress(self->compressor, bytes, *count, self->packed, w->packed_limit);
+    return self->packed;
+}
+
 static tl_status write_tile(void *context, tl_parallel *loop, uint64_t tile, unsigned index, tl_error *error)
 {
     writing *w = context;
     worker *self = &w->workers[index];
-    tl_window window = out_tile_window(&w->tiling, tile);
-    tl_status status = tl_source_read(w->source, w->source->info.level, window, self->heights, error);
+    tl_status status = read_tile(w, self, out_tile_window(&w->tiling, tile), error);
     if (status != TL_OK)
         return status;
-    pad_tile(self->heights, window);
-    void *bytes = self->heights;
-    size_t count = TILE_BYTES;
-    if (w->compress) {
-        predict_rows(self->heights, self->predicted);
-        count = libdeflate_zlib_compress(self->compressor, self->predicted, TILE_BYTES, self->packed, w->packed_limit);
-        bytes = self->packed;
-    }
+    size_t count;
+    const void *bytes = pack_tile(w, self, &count);
     if (!tl_parallel_wait_turn(loop, tile))
         return tl_fail(error, TL_ERROR_CANCELLED, "interrupted");
     errno = 0;
-    if (TIFFWriteRawTile(w->tiff, (uint32_t)tile, bytes, (tmsize_t)count) != (tmsize_t)count)
+    if (TIFFWriteRawTile(w->tiff, (uint32_t)tile, (void *)bytes, (tmsize_t)count) != (tmsize_t)count)
         return tiff_failed(w->path, &w->said, error);
     tl_parallel_end_turn(loop, tile);
     return TL_OK;
@@ -325,19 +349,18 @@ static TIFF *open_tiff(tl_output *output, bool big, complaint *said)
     return tiff;
 }
 
-tl_status out_geotiff_write(const tl_source *source, tl_output *output, const tl_write_options *options,
-                            tl_error *error)
+static tl_status write_geotiff(const tl_source *source, bool validity, tl_output *output,
+                               const tl_write_options *options, tl_error *error)
 {
     const tl_source_info *info = &source->info;
-    writing w = {.source = source, .path = tl_output_path(output), .tiling = out_tiling_of(source)};
+    writing w = {
+        .source = source, .validity = validity, .path = tl_output_path(output), .tiling = out_tiling_of(source)};
     int64_t samples;
     if (info->width > INT32_MAX || info->height > INT32_MAX || !tl_int64_mul(info->width, info->height, &samples) ||
         w.tiling.columns * w.tiling.rows > INT32_MAX)
         return tl_fail(error, TL_ERROR_ARGUMENT,
                        "%s: %lld x %lld samples are too many for a TIFF; refine by fewer levels", w.path,
                        (long long)info->width, (long long)info->height);
-    if (options->compression == TL_COMPRESSION_PIZ || options->compression == TL_COMPRESSION_ZIPS)
-        return tl_fail(error, TL_ERROR_ARGUMENT, "%s: piz and zips are compressions of EXR; use zip or none", w.path);
     w.compress = options->compression != TL_COMPRESSION_NONE;
     w.packed_limit = libdeflate_zlib_compress_bound(NULL, TILE_BYTES);
     XTIFFInitialize();
@@ -345,8 +368,8 @@ tl_status out_geotiff_write(const tl_source *source, tl_output *output, const tl
     if (!w.tiff)
         return tiff_failed(w.path, &w.said, error);
     errno = 0;
-    tl_status status = set_directory(w.tiff, info, w.compress) ? write_tiles(&w, options->run, error)
-                                                               : tiff_failed(w.path, &w.said, error);
+    tl_status status = set_directory(w.tiff, info, w.compress, validity) ? write_tiles(&w, options->run, error)
+                                                                         : tiff_failed(w.path, &w.said, error);
     /* TIFFClose cannot fail, so what it would do is done here */
     errno = 0;
     if (status == TL_OK && (!TIFFWriteDirectory(w.tiff) || w.said.made))
@@ -355,4 +378,19 @@ tl_status out_geotiff_write(const tl_source *source, tl_output *output, const tl
     if (status == TL_OK && w.said.made)
         status = tiff_failed(w.path, &w.said, error);
     return status;
+}
+
+tl_status out_geotiff_write(const tl_source *source, tl_output *output, const tl_write_options *options,
+                            tl_error *error)
+{
+    if (options->compression == TL_COMPRESSION_PIZ || options->compression == TL_COMPRESSION_ZIPS)
+        return tl_fail(error, TL_ERROR_ARGUMENT, "%s: piz and zips are compressions of EXR; use zip or none",
+                       tl_output_path(output));
+    return write_geotiff(source, false, output, options, error);
+}
+
+tl_status out_validity_write(const tl_source *source, tl_output *output, const tl_write_options *options,
+                             tl_error *error)
+{
+    return write_geotiff(source, true, output, options, error);
 }

@@ -11,6 +11,9 @@ enum { OUT_TILE = 256 }; /* samples on a side of the tiles in which grids are pu
 tl_status out_exr_write(const tl_source *source, tl_output *output, const tl_write_options *options, tl_error *error);
 tl_status out_geotiff_write(const tl_source *source, tl_output *output, const tl_write_options *options,
                             tl_error *error);
+/* The validity of a source's samples as a GeoTIFF of bytes. */
+tl_status out_validity_write(const tl_source *source, tl_output *output, const tl_write_options *options,
+                             tl_error *error);
 tl_status out_gltf_write(const tl_mesh *mesh, tl_output *output, const tl_write_options *options, tl_error *error);
 tl_status out_obj_write(const tl_mesh *mesh, tl_output *output, const tl_write_options *options, tl_error *error);
 tl_status out_ply_write(const tl_mesh *mesh, tl_output *output, const tl_write_options *options, tl_error *error);

@@ -27,18 +27,28 @@ static void swap_rows(float *a, float *b, int64_t width)
     }
 }
 
-static tl_status north_up_read(const tl_source *self, int level, tl_window window, float *out, tl_error *error)
+/* Where a window lies in the original. */
+static tl_status window_of_original(const north_up *n, int level, tl_window window, tl_window *out, tl_error *error)
 {
-    const north_up *n = (const north_up *)self;
     int64_t width, height;
     tl_status status = tl_source_size(n->original, level, &width, &height, error);
     if (status != TL_OK)
         return status;
+    *out = window;
     if (n->columns)
-        window.x = width - window.x - window.width;
+        out->x = width - window.x - window.width;
     if (n->rows)
-        window.y = height - window.y - window.height;
-    status = tl_source_read(n->original, level, window, out, error);
+        out->y = height - window.y - window.height;
+    return TL_OK;
+}
+
+static tl_status north_up_read(const tl_source *self, int level, tl_window window, float *out, tl_error *error)
+{
+    const north_up *n = (const north_up *)self;
+    tl_window theirs;
+    tl_status status = window_of_original(n, level, window, &theirs, error);
+    if (status == TL_OK)
+        status = tl_source_read(n->original, level, theirs, out, error);
     if (status != TL_OK)
         return status;
     for (int64_t y = 0; n->columns && y < window.height; y++)
@@ -46,6 +56,27 @@ static tl_status north_up_read(const tl_source *self, int level, tl_window windo
     for (int64_t y = 0; n->rows && y < window.height / 2; y++)
         swap_rows(out + y * window.width, out + (window.height - 1 - y) * window.width, window.width);
     return TL_OK;
+}
+
+static tl_status north_up_validity(const tl_source *self, int level, tl_window window, unsigned char *out,
+                                   tl_error *error)
+{
+    const north_up *n = (const north_up *)self;
+    size_t samples = (size_t)(window.width * window.height);
+    unsigned char *turned = tl_alloc(samples, 1);
+    if (!turned)
+        return tl_fail_memory(error, self->info.name);
+    tl_window theirs;
+    tl_status status = window_of_original(n, level, window, &theirs, error);
+    if (status == TL_OK)
+        status = tl_source_validity(n->original, level, theirs, turned, error);
+    for (int64_t y = 0; status == TL_OK && y < window.height; y++)
+        for (int64_t x = 0; x < window.width; x++) {
+            int64_t i = n->columns ? window.width - 1 - x : x, j = n->rows ? window.height - 1 - y : y;
+            out[y * window.width + x] = turned[j * window.width + i];
+        }
+    free(turned);
+    return status;
 }
 
 static tl_status north_up_size(const tl_source *self, int level, int64_t *width, int64_t *height, tl_error *error)
@@ -65,8 +96,11 @@ tl_source *scene_north_up(const tl_source *source, tl_error *error)
         tl_fail_memory(error, source->info.name);
         return NULL;
     }
-    n->source =
-        (tl_source){.info = source->info, .read = north_up_read, .size = north_up_size, .destroy = north_up_destroy};
+    n->source = (tl_source){.info = source->info,
+                            .read = north_up_read,
+                            .validity = north_up_validity,
+                            .size = north_up_size,
+                            .destroy = north_up_destroy};
     n->original = source;
     double *t = n->source.info.georef.transform;
     bool upright = t[2] == 0 && t[4] == 0;
