@@ -1,5 +1,6 @@
 #include "dem/crs.h"
 
+#include "dem/crs_map.h"
 #include "dem/geographiclib.h"
 #include "lib/base/error.h"
 #include "lib/base/size.h"
@@ -11,7 +12,8 @@
 
 struct dem_projection {
     PJ_CONTEXT *context;
-    PJ *to_lonlat; /* NULL: coordinates are longitude and latitude already */
+    dem_map *map;  /* GeographicLib's, where it has the projection */
+    PJ *to_lonlat; /* else PROJ's; both NULL: coordinates are longitude and latitude already */
 };
 
 struct dem_local_frame {
@@ -47,10 +49,9 @@ bool dem_crs_equivalent(const tl_crs *a, const tl_crs *b)
 /* ---- Projections ---- */
 
 /* The operation from a projected CRS to its own geographic CRS in degrees, in the order x, y to longitude, latitude. */
-static PJ *make_operation(PJ_CONTEXT *context, const char *wkt)
+static PJ *make_operation(PJ_CONTEXT *context, const PJ *crs)
 {
-    PJ *crs = proj_create(context, wkt);
-    PJ *base = crs ? proj_crs_get_geodetic_crs(context, crs) : NULL;
+    PJ *base = proj_crs_get_geodetic_crs(context, crs);
     PJ *degrees =
         base ? proj_crs_alter_cs_angular_unit(context, base, "degree", 0.017453292519943295, NULL, NULL) : NULL;
     PJ *any_order = degrees ? proj_create_crs_to_crs_from_pj(context, crs, degrees, NULL, NULL) : NULL;
@@ -58,8 +59,19 @@ static PJ *make_operation(PJ_CONTEXT *context, const char *wkt)
     proj_destroy(any_order);
     proj_destroy(degrees);
     proj_destroy(base);
-    proj_destroy(crs);
     return operation;
+}
+
+/* GeographicLib is exact where PROJ iterates, and much the same everywhere: PROJ has what it does not have. */
+static void find_map(dem_projection *projection, const tl_crs *crs)
+{
+    dem_map_definition definition;
+    PJ *object = proj_create(projection->context, crs->wkt);
+    if (object && dem_crs_map(projection->context, object, crs, &definition))
+        projection->map = dem_map_create(&definition);
+    if (object && !projection->map)
+        projection->to_lonlat = make_operation(projection->context, object);
+    proj_destroy(object);
 }
 
 static tl_status prepare(dem_projection *projection, const tl_crs *crs, tl_error *error)
@@ -71,8 +83,8 @@ static tl_status prepare(dem_projection *projection, const tl_crs *crs, tl_error
         return tl_fail_memory(error, crs->name);
     proj_log_level(projection->context, PJ_LOG_NONE);
     proj_context_set_enable_network(projection->context, 0);
-    projection->to_lonlat = make_operation(projection->context, crs->wkt);
-    if (!projection->to_lonlat)
+    find_map(projection, crs);
+    if (!projection->map && !projection->to_lonlat)
         return tl_fail(error, TL_ERROR_DATA, "PROJ cannot convert coordinates of %s to longitude and latitude",
                        crs->name);
     return TL_OK;
@@ -95,20 +107,40 @@ void dem_projection_destroy(dem_projection *projection)
 {
     if (!projection)
         return;
+    dem_map_destroy(projection->map);
     proj_destroy(projection->to_lonlat);
     if (projection->context) /* NULL would be PROJ's default context */
         proj_context_destroy(projection->context);
     free(projection);
 }
 
-void dem_projection_to_lonlat(dem_projection *projection, size_t n, double *x, double *y)
+const char *dem_projection_engine(const dem_projection *projection)
 {
-    if (!projection->to_lonlat)
-        return;
-    proj_trans_generic(projection->to_lonlat, PJ_FWD, x, sizeof *x, n, y, sizeof *y, n, NULL, 0, 0, NULL, 0, 0);
+    return projection->map ? "GeographicLib" : projection->to_lonlat ? "PROJ" : "none";
+}
+
+static void transform(PJ *operation, PJ_DIRECTION direction, size_t n, double *x, double *y)
+{
+    proj_trans_generic(operation, direction, x, sizeof *x, n, y, sizeof *y, n, NULL, 0, 0, NULL, 0, 0);
     for (size_t k = 0; k < n; k++)
         if (!isfinite(x[k]) || !isfinite(y[k]))
             x[k] = y[k] = (double)NAN;
+}
+
+void dem_projection_to_lonlat(dem_projection *projection, size_t n, double *x, double *y)
+{
+    if (projection->map)
+        dem_map_to_lonlat(projection->map, n, x, y);
+    else if (projection->to_lonlat)
+        transform(projection->to_lonlat, PJ_FWD, n, x, y);
+}
+
+void dem_projection_from_lonlat(dem_projection *projection, size_t n, double *longitude, double *latitude)
+{
+    if (projection->map)
+        dem_map_from_lonlat(projection->map, n, longitude, latitude);
+    else if (projection->to_lonlat)
+        transform(projection->to_lonlat, PJ_INV, n, longitude, latitude);
 }
 
 /* ---- Local frames ---- */

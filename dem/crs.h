@@ -20,13 +20,17 @@ tl_status dem_crs_from_text(const char *text, const char *path, tl_crs **out, tl
  */
 bool dem_crs_equivalent(const tl_crs *a, const tl_crs *b);
 
-/* From coordinates of a CRS to longitude (east of its own prime meridian) and latitude in degrees on its own datum.
- * Thread-safe as long as each thread has its own. */
+/* Between coordinates of a CRS and longitude (east of its own prime meridian) and latitude in degrees on its own datum.
+ * GeographicLib's where it has the projection, else PROJ's. Thread-safe as long as each thread has its own. */
 typedef struct dem_projection dem_projection;
 dem_projection *dem_projection_create(const tl_crs *crs, tl_error *error);
 void dem_projection_destroy(dem_projection *projection);
 /* In place, n points; x, y become longitude, latitude. What cannot be transformed becomes NaN. */
 void dem_projection_to_lonlat(dem_projection *projection, size_t n, double *x, double *y);
+/* The other way; longitude, latitude become x, y. */
+void dem_projection_from_lonlat(dem_projection *projection, size_t n, double *longitude, double *latitude);
+/* Whose formulas it uses: "GeographicLib", "PROJ", or "none" for longitude and latitude themselves. */
+const char *dem_projection_engine(const dem_projection *projection);
 
 /* Metres east, north and up in the plane tangent to the ellipsoid at an origin. */
 typedef struct dem_local_frame dem_local_frame;

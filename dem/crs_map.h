@@ -1,0 +1,14 @@
+/* Map projections by their parameters, as PROJ tells them. */
+#ifndef DEM_CRS_MAP_H
+#define DEM_CRS_MAP_H
+
+#include "dem/geographiclib.h"
+#include "lib/base/georef.h"
+
+#include <proj.h>
+
+/* The map of a projected CRS, whose PROJ object is `object`; false where GeographicLib has no such projection, or where
+ * its coordinates do not run to the east and to the north. */
+bool dem_crs_map(PJ_CONTEXT *context, const PJ *object, const tl_crs *crs, dem_map_definition *out);
+
+#endif
