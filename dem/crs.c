@@ -39,11 +39,16 @@ static bool equivalent_wkt(const char *a, const char *b)
     return same;
 }
 
+static const char *horizontal_wkt(const tl_crs *crs)
+{
+    return crs->horizontal_wkt ? crs->horizontal_wkt : crs->wkt;
+}
+
 bool dem_crs_equivalent(const tl_crs *a, const tl_crs *b)
 {
     if (a == b || (a->epsg && a->epsg == b->epsg) || (*a->wkt && strcmp(a->wkt, b->wkt) == 0))
         return true;
-    return !(a->epsg && b->epsg) && equivalent_wkt(a->wkt, b->wkt);
+    return !(a->epsg && b->epsg) && equivalent_wkt(horizontal_wkt(a), horizontal_wkt(b));
 }
 
 /* ---- Projections ---- */
@@ -66,7 +71,7 @@ static PJ *make_operation(PJ_CONTEXT *context, const PJ *crs)
 static void find_map(dem_projection *projection, const tl_crs *crs)
 {
     dem_map_definition definition;
-    PJ *object = proj_create(projection->context, crs->wkt);
+    PJ *object = proj_create(projection->context, horizontal_wkt(crs));
     if (object && dem_crs_map(projection->context, object, crs, &definition))
         projection->map = dem_map_create(&definition);
     if (object && !projection->map)
@@ -198,6 +203,8 @@ tl_status dem_georef_measure(tl_georef *georef, int64_t width, int64_t height, t
     const double *t = georef->transform;
     const tl_crs *crs = georef->crs;
     double unit = georef->located && crs ? crs->unit : 1;
+    if (crs && crs->vertical_unit > 0 && georef->height_unit == 1)
+        georef->height_unit = crs->vertical_unit;
     georef->cell_x = hypot(t[1], t[4]) * unit;
     georef->cell_y = hypot(t[2], t[5]) * unit;
     if (!georef->located || !crs || !crs->geographic)

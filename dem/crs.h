@@ -15,8 +15,8 @@ tl_status dem_crs_from_tiff_scaled(struct tiff *tiff, const char *path, tl_crs *
  */
 tl_status dem_crs_from_text(const char *text, const char *path, tl_crs **out, tl_error *error);
 
-/* Whether two CRSs give the same places the same coordinates, by their codes or, where one has none, by PROJ's
- * judgement.
+/* Whether two CRSs give the same places the same horizontal coordinates, by their codes or, where one has none, by
+ * PROJ's judgement.
  */
 bool dem_crs_equivalent(const tl_crs *a, const tl_crs *b);
 
@@ -42,8 +42,9 @@ void dem_local_frame_forward(const dem_local_frame *frame, double longitude, dou
                              double xyz[3]);
 
 /* Fills in cell_x and cell_y of `georef`, whose crs, located and transform are set, for a raster of width x height
- * samples. Where the transform puts the raster's middle beyond a pole, so that its angles cannot be meant, a degree
- * counts as a metre, as units of an unknown CRS do; a raster that is not located has cells of 1. */
+ * samples, and height_unit by the vertical part of the CRS where it is 1. Where the transform puts
+ * the raster's middle beyond a pole, so that its angles cannot be meant, a degree counts as a metre, as units of an
+ * unknown CRS do; a raster that is not located has cells of 1. */
 tl_status dem_georef_measure(tl_georef *georef, int64_t width, int64_t height, tl_error *error);
 
 /* Whether a raster in longitude and latitude goes once around: its columns are 360 degrees, to half a cell. */

@@ -58,15 +58,28 @@ static PJ *horizontal(PJ_CONTEXT *context, PJ *crs)
     return crs;
 }
 
-/* What one unit of the first axis is in metres or radians; 0 where it cannot be told. */
-static double axis_unit(PJ_CONTEXT *context, const PJ *crs)
+/* What one unit of an axis is in metres or radians; 0 where it cannot be told. */
+static double unit_of_axis(PJ_CONTEXT *context, const PJ *crs, int axis)
 {
     double unit = 0;
     PJ *system = proj_crs_get_coordinate_system(context, crs);
-    if (system && !proj_cs_get_axis_info(context, system, 0, NULL, NULL, NULL, &unit, NULL, NULL, NULL))
+    if (system && !proj_cs_get_axis_info(context, system, axis, NULL, NULL, NULL, &unit, NULL, NULL, NULL))
         unit = 0;
     proj_destroy(system);
     return unit;
+}
+
+static double axis_unit(PJ_CONTEXT *context, const PJ *crs)
+{
+    return unit_of_axis(context, crs, 0);
+}
+
+static int axis_count(PJ_CONTEXT *context, const PJ *crs)
+{
+    PJ *system = proj_crs_get_coordinate_system(context, crs);
+    int count = system ? proj_cs_get_axis_count(context, system) : 0;
+    proj_destroy(system);
+    return count;
 }
 
 static bool read_ellipsoid(PJ_CONTEXT *context, const PJ *crs, tl_crs *out)
@@ -81,15 +94,25 @@ static bool read_ellipsoid(PJ_CONTEXT *context, const PJ *crs, tl_crs *out)
     return found;
 }
 
-static bool read_names(PJ_CONTEXT *context, const PJ *crs, tl_crs *out)
+static char *wkt_of(PJ_CONTEXT *context, const PJ *crs)
 {
     const char *const options[] = {"MULTILINE=NO", NULL};
-    const char *name = proj_get_name(crs), *wkt = proj_as_wkt(context, crs, PJ_WKT2_2019, options);
+    const char *wkt = proj_as_wkt(context, crs, PJ_WKT2_2019, options);
+    return strdup(wkt ? wkt : "");
+}
+
+static int epsg_of(const PJ *crs)
+{
     const char *authority = proj_get_id_auth_name(crs, 0), *code = proj_get_id_code(crs, 0);
+    return authority && code && strcmp(authority, "EPSG") == 0 ? atoi(code) : 0;
+}
+
+static bool read_names(PJ_CONTEXT *context, const PJ *crs, tl_crs *out)
+{
+    const char *name = proj_get_name(crs);
     out->name = strdup(name && *name ? name : "unknown");
-    out->wkt = strdup(wkt ? wkt : "");
-    if (authority && code && strcmp(authority, "EPSG") == 0)
-        out->epsg = atoi(code);
+    out->wkt = wkt_of(context, crs);
+    out->epsg = epsg_of(crs);
     return out->name && out->wkt;
 }
 
@@ -113,11 +136,68 @@ static tl_status describe(PJ_CONTEXT *context, const PJ *crs, const char *path, 
     return TL_OK;
 }
 
-/* Takes `crs`, which may be NULL. A geographic one gets degrees; *to_degrees is what its own unit was in degrees. */
-static tl_status finish(PJ_CONTEXT *context, PJ *crs, const char *path, tl_crs **out, double *to_degrees,
-                        tl_error *error)
+/* ---- Heights ---- */
+
+/* The vertical CRS in a compound one, without what binds it to another; NULL where there is none. */
+static PJ *vertical_part(PJ_CONTEXT *context, const PJ *whole)
 {
-    crs = horizontal(context, crs);
+    PJ *part = proj_get_type(whole) == PJ_TYPE_COMPOUND_CRS ? proj_crs_get_sub_crs(context, whole, 1) : NULL;
+    if (part && proj_get_type(part) == PJ_TYPE_BOUND_CRS)
+        part = replace(part, proj_get_source_crs(context, part));
+    if (!part || proj_get_type(part) == PJ_TYPE_VERTICAL_CRS)
+        return part;
+    proj_destroy(part);
+    return NULL;
+}
+
+/* Makes `wkt` that of the whole and keeps that of the horizontal part. */
+static bool set_whole(PJ_CONTEXT *context, const PJ *whole, tl_crs *crs)
+{
+    char *wkt = whole ? wkt_of(context, whole) : NULL;
+    if (!wkt)
+        return false;
+    if (!*wkt) {
+        free(wkt);
+        return true;
+    }
+    crs->horizontal_wkt = crs->wkt;
+    crs->wkt = wkt;
+    return true;
+}
+
+/* The vertical part of `whole`, or its third axis, goes into a CRS that was made of its horizontal part; false when out
+ * of memory. `altered`: the horizontal part has another unit now. */
+static bool read_heights(PJ_CONTEXT *context, const PJ *whole, PJ *horizontal_crs, bool altered, tl_crs *crs)
+{
+    PJ *vertical = vertical_part(context, whole);
+    bool good = true;
+    if (vertical) {
+        const char *name = proj_get_name(vertical);
+        /* without its own code, for then its parts keep theirs in the text */
+        PJ *rebuilt = proj_create_compound_crs(context, proj_get_name(whole), horizontal_crs, vertical);
+        crs->vertical_name = strdup(name && *name ? name : "unknown");
+        crs->vertical_epsg = epsg_of(vertical);
+        crs->vertical_unit = axis_unit(context, vertical);
+        good = crs->vertical_name && set_whole(context, rebuilt ? rebuilt : whole, crs);
+        proj_destroy(rebuilt);
+        proj_destroy(vertical);
+    } else if (axis_count(context, whole) == 3 && !altered) {
+        crs->vertical_name = strdup("ellipsoidal height");
+        crs->vertical_unit = unit_of_axis(context, whole, 2);
+        good = crs->vertical_name && set_whole(context, whole, crs);
+    }
+    if (!isfinite(crs->vertical_unit) || crs->vertical_unit < 0)
+        crs->vertical_unit = 0;
+    return good;
+}
+
+/* ---- The whole ---- */
+
+/* `whole` may be NULL. A geographic CRS gets degrees; *to_degrees is what its own unit was in degrees. */
+static tl_status make_crs(PJ_CONTEXT *context, const PJ *whole, const char *path, tl_crs **out, double *to_degrees,
+                          tl_error *error)
+{
+    PJ *crs = whole ? horizontal(context, proj_clone(context, whole)) : NULL;
     PJ_TYPE type = crs ? proj_get_type(crs) : PJ_TYPE_UNKNOWN;
     *to_degrees = 1;
     if (type != PJ_TYPE_PROJECTED_CRS && type != PJ_TYPE_GEOGRAPHIC_2D_CRS) {
@@ -135,8 +215,24 @@ static tl_status finish(PJ_CONTEXT *context, PJ *crs, const char *path, tl_crs *
                 crs, proj_crs_alter_cs_angular_unit(context, crs, "degree", 1 / degrees_per_radian, "EPSG", "9122"));
         }
     }
-    tl_status status = describe(context, crs, path, out, error);
+    tl_crs *made = NULL;
+    tl_status status = describe(context, crs, path, &made, error);
+    if (status == TL_OK && !read_heights(context, whole, crs, *to_degrees != 1, made)) {
+        tl_crs_release(made);
+        status = tl_fail_memory(error, path);
+    }
     proj_destroy(crs);
+    if (status == TL_OK)
+        *out = made;
+    return status;
+}
+
+/* The same; takes `whole`. */
+static tl_status finish(PJ_CONTEXT *context, PJ *whole, const char *path, tl_crs **out, double *to_degrees,
+                        tl_error *error)
+{
+    tl_status status = make_crs(context, whole, path, out, to_degrees, error);
+    proj_destroy(whole);
     return status;
 }
 
@@ -362,6 +458,72 @@ static PJ *from_definition(PJ_CONTEXT *context, GTIFDefn *definition, const dem_
     return model == ModelTypeGeographic ? geographic_from(context, definition, keys) : NULL;
 }
 
+/* ---- Heights by their keys ---- */
+
+/* The codes that GeoTIFF 1.0 lists: 5101 to 5106 name what EPSG has as 5701 to 5706, 5001 to 5033 heights above
+ * ellipsoids. */
+enum { FIRST_ELLIPSOID = 5001, LAST_ELLIPSOID = 5033, FIRST_OLD = 5101, LAST_OLD = 5106, OLD_TO_EPSG = 600 };
+
+/* The vertical CRS of a code; NULL where that is none. */
+static PJ *vertical_from_code(PJ_CONTEXT *context, unsigned code)
+{
+    if (code >= FIRST_OLD && code <= LAST_OLD)
+        code += OLD_TO_EPSG;
+    PJ *crs = is_code(code) ? from_code(context, code) : NULL;
+    if (!crs || proj_get_type(crs) == PJ_TYPE_VERTICAL_CRS)
+        return crs;
+    proj_destroy(crs);
+    return NULL;
+}
+
+/* One that the file names without a code. */
+static PJ *vertical_from_name(PJ_CONTEXT *context, const dem_geokeys *keys)
+{
+    char name[128] = "", code[16];
+    uint16_t datum_code = 0;
+    read_citation(keys, VerticalCitationGeoKey, "VCS Name = ", name, sizeof name);
+    if (!*name)
+        return NULL;
+    dem_geokeys_short(keys, VerticalDatumGeoKey, &datum_code);
+    snprintf(code, sizeof code, "%u", (unsigned)datum_code);
+    PJ *datum =
+        is_code(datum_code) ? proj_create_from_database(context, "EPSG", code, PJ_CATEGORY_DATUM, 0, NULL) : NULL;
+    PJ *crs = proj_create_vertical_crs(context, name, datum ? proj_get_name(datum) : name, "metre", 1);
+    proj_destroy(datum);
+    return crs;
+}
+
+static bool has_heights(const dem_geokeys *keys)
+{
+    uint16_t code = 0;
+    char *name = dem_geokeys_text(keys, VerticalCitationGeoKey);
+    bool any = name || (dem_geokeys_short(keys, VerticalCSTypeGeoKey, &code) && code);
+    free(name);
+    return any;
+}
+
+/* Takes a CRS (or NULL) and adds the heights that the keys speak of. */
+static PJ *with_heights(PJ_CONTEXT *context, PJ *crs, const dem_geokeys *keys)
+{
+    uint16_t code = 0, unit = 0;
+    dem_geokeys_short(keys, VerticalCSTypeGeoKey, &code);
+    crs = horizontal(context, crs);
+    if (!crs || (code >= FIRST_ELLIPSOID && code <= LAST_ELLIPSOID))
+        return crs ? replace(crs, proj_crs_promote_to_3D(context, NULL, crs)) : NULL;
+    PJ *vertical = vertical_from_code(context, code);
+    if (!vertical)
+        vertical = vertical_from_name(context, keys);
+    if (!vertical)
+        return crs;
+    if (dem_geokeys_short(keys, VerticalUnitsGeoKey, &unit) && is_code(unit))
+        vertical = with_unit(context, vertical, dem_geokeys_height_unit(keys));
+    char name[320];
+    snprintf(name, sizeof name, "%.150s + %.150s", proj_get_name(crs), proj_get_name(vertical));
+    crs = replace(crs, proj_create_compound_crs(context, name, crs, vertical));
+    proj_destroy(vertical);
+    return crs;
+}
+
 /* ---- From a file to keys ---- */
 
 __attribute__((format(printf, 3, 4))) static void ignore_message(GTIF *gtif, int level, const char *message, ...)
@@ -392,6 +554,8 @@ static PJ *crs_from_keys(PJ_CONTEXT *context, const dem_geokeys *keys)
         GTIFAttachPROJContext(gtif, context);
         GTIFGetDefn(gtif, definition);
         crs = from_definition(context, definition, keys);
+        if (has_heights(keys))
+            crs = with_heights(context, crs, keys);
     }
     GTIFFreeDefn(definition);
     if (gtif)
@@ -456,6 +620,9 @@ static tl_status from_keys(dem_geokeys *keys, const char *path, tl_crs **out, do
     proj_context_destroy(context);
     if (status != TL_OK)
         return status;
+    uint16_t height_unit;
+    if (crs->vertical_name && dem_geokeys_short(keys, VerticalUnitsGeoKey, &height_unit) && is_code(height_unit))
+        crs->vertical_unit = dem_geokeys_height_unit(keys);
     double said = angle_in_degrees(keys);
     if (crs->geographic && said > 0)
         *scale = said;

@@ -81,10 +81,15 @@ typedef struct tl_crs tl_crs;
 
 /* Name of the CRS, as "NAD83 / UTM zone 11N"; never NULL. */
 TL_API const char *tl_crs_name(const tl_crs *crs);
-/* WKT2:2019 of the CRS on one line; "" where it cannot be had. */
+/* WKT2:2019 of the CRS on one line, a COMPOUNDCRS where it has a vertical part; "" where it cannot be had. */
 TL_API const char *tl_crs_wkt(const tl_crs *crs);
-/* EPSG code of the CRS, 0 where it has none. */
+/* EPSG code of the CRS (of its horizontal part), 0 where it has none. */
 TL_API int tl_crs_epsg(const tl_crs *crs);
+/* Name of the vertical CRS that heights count in, as "NAVD88 height (ft)", or "ellipsoidal height"; "" where the data
+ * do not say. */
+TL_API const char *tl_crs_vertical_name(const tl_crs *crs);
+/* EPSG code of the vertical CRS, 0 where it has none. */
+TL_API int tl_crs_vertical_epsg(const tl_crs *crs);
 /* Whether its coordinates are longitude and latitude (in degrees, in this order, always). */
 TL_API bool tl_crs_is_geographic(const tl_crs *crs);
 

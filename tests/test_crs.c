@@ -194,6 +194,81 @@ static void feetOfHeightAreKnown(void **state)
     }
 }
 
+static void verticalKeysGiveNameCodeAndUnit(void **state)
+{
+    (void)state;
+    const struct {
+        uint16_t code, unit; /* 0: no such key */
+        const char *citation, *name;
+        int epsg;
+        double metres;
+        const char *wkt; /* how it begins */
+    } cases[] = {
+        {0, 0, NULL, "", 0, 1, "GEOGCRS"},
+        {0, 9002, NULL, "", 0, 0.3048, "GEOGCRS"},
+        {5703, 0, NULL, "NAVD88 height", 5703, 1, "COMPOUNDCRS"},
+        {5703, 9003, NULL, "NAVD88 height", 0, 1200.0 / 3937.0, "COMPOUNDCRS"},
+        {5703, 9001, NULL, "NAVD88 height", 5703, 1, "COMPOUNDCRS"},
+        {8228, 0, NULL, "NAVD88 height (ft)", 8228, 0.3048, "COMPOUNDCRS"},
+        {6360, 0, NULL, "NAVD88 height (ftUS)", 6360, 1200.0 / 3937.0, "COMPOUNDCRS"},
+        {5103, 0, NULL, "NAVD88 height", 5703, 1, "COMPOUNDCRS"}, /* GeoTIFF 1.0 */
+        {5030, 0, NULL, "ellipsoidal height", 0, 1, "GEOGCRS"},
+        {5030, 9002, NULL, "ellipsoidal height", 0, 0.3048, "GEOGCRS"},
+        {32767, 9002, "Old gauge|", "Old gauge", 0, 0.3048, "COMPOUNDCRS"},
+        {4326, 0, NULL, "", 0, 1, "GEOGCRS"}, /* none of heights */
+    };
+    for (size_t k = 0; k < sizeof cases / sizeof *cases; k++) {
+        uint16_t keys[20] = {1024, 0, 1, 2, 2048, 0, 1, 4326};
+        unsigned count = 2;
+        const struct {
+            uint16_t key, place, length, value;
+        } more[] = {{4096, 0, 1, cases[k].code},
+                    {4097, 34737, cases[k].citation ? (uint16_t)strlen(cases[k].citation) : 0, 0},
+                    {4099, 0, 1, cases[k].unit}};
+        for (int m = 0; m < 3; m++)
+            if (m == 1 ? cases[k].citation != NULL : more[m].value != 0)
+                memcpy(keys + 4 * count++, &more[m], sizeof more[m]);
+        tl_source *source = open_with(keys, count, NULL, 0, cases[k].citation, NULL, NULL);
+        const tl_georef *georef = &source->info.georef;
+        assert_string_equal(tl_crs_vertical_name(georef->crs), cases[k].name);
+        assert_int_equal(tl_crs_vertical_epsg(georef->crs), cases[k].epsg);
+        close_to(georef->height_unit, cases[k].metres, 1e-12);
+        assert_int_equal(strncmp(tl_crs_wkt(georef->crs), cases[k].wkt, strlen(cases[k].wkt)), 0);
+        assert_int_equal(tl_crs_epsg(georef->crs), 4326);
+        /* the text alone means the same */
+        tl_crs *again = crs_of(tl_crs_wkt(georef->crs));
+        assert_string_equal(tl_crs_vertical_name(again), cases[k].name);
+        assert_int_equal(tl_crs_epsg(again), 4326);
+        tl_crs_release(again);
+        tl_source_destroy(source);
+    }
+}
+
+static void compoundSystemsProjectLikeTheirHorizontalPart(void **state)
+{
+    (void)state;
+    const struct {
+        const char *text, *vertical;
+        int code;
+    } cases[] = {{"EPSG:7405", "ODN height", 5701}, {"EPSG:27700+5701", "ODN height", 5701}, {"EPSG:27700", "", 0}};
+    double expected[2] = {0, 0};
+    tl_crs *first = crs_of(cases[0].text);
+    for (size_t k = 0; k < sizeof cases / sizeof *cases; k++) {
+        tl_crs *crs = crs_of(cases[k].text);
+        assert_int_equal(tl_crs_epsg(crs), 27700);
+        assert_string_equal(tl_crs_vertical_name(crs), cases[k].vertical);
+        assert_int_equal(tl_crs_vertical_epsg(crs), cases[k].code);
+        assert_true(dem_crs_equivalent(first, crs));
+        double lonlat[2];
+        to_lonlat(crs, 400000, 200000, lonlat);
+        close_to(lonlat[0], k ? expected[0] : -2, k ? 0 : 1e-3);
+        close_to(lonlat[1], k ? expected[1] : 51.698, k ? 0 : 1e-3);
+        memcpy(expected, lonlat, sizeof expected);
+        tl_crs_release(crs);
+    }
+    tl_crs_release(first);
+}
+
 static void textsOfEveryKindGiveTheHorizontalCrs(void **state)
 {
     (void)state;
@@ -361,6 +436,8 @@ int main(void)
         cmocka_unit_test(anglesInGradsBecomeDegrees),
         cmocka_unit_test(crsThatNobodyKnowsLeavesTheHeightsReadable),
         cmocka_unit_test(feetOfHeightAreKnown),
+        cmocka_unit_test(verticalKeysGiveNameCodeAndUnit),
+        cmocka_unit_test(compoundSystemsProjectLikeTheirHorizontalPart),
         cmocka_unit_test(textsOfEveryKindGiveTheHorizontalCrs),
         cmocka_unit_test(northingFirstSystemsKeepEastingAsX),
         cmocka_unit_test(pointsWithoutAnImageAreNan),

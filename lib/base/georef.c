@@ -28,6 +28,8 @@ void tl_crs_release(const tl_crs *crs)
         return;
     free(own->name);
     free(own->wkt);
+    free(own->horizontal_wkt);
+    free(own->vertical_name);
     free(own->key_directory);
     free(own->key_doubles);
     free(own->key_ascii);
@@ -47,6 +49,16 @@ const char *tl_crs_wkt(const tl_crs *crs)
 int tl_crs_epsg(const tl_crs *crs)
 {
     return crs->epsg;
+}
+
+const char *tl_crs_vertical_name(const tl_crs *crs)
+{
+    return crs->vertical_name ? crs->vertical_name : "";
+}
+
+int tl_crs_vertical_epsg(const tl_crs *crs)
+{
+    return crs->vertical_epsg;
 }
 
 bool tl_crs_is_geographic(const tl_crs *crs)

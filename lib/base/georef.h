@@ -9,8 +9,12 @@
 
 struct tl_crs {
     atomic_uint references;
-    char *name, *wkt; /* never NULL */
-    int epsg;         /* 0: none */
+    char *name, *wkt;     /* never NULL */
+    char *horizontal_wkt; /* without the vertical part; NULL: `wkt` has none */
+    char *vertical_name;  /* NULL: none */
+    int epsg;             /* of the horizontal part; 0: none */
+    int vertical_epsg;
+    double vertical_unit; /* metres in one unit of height by the vertical part; 0: it has none */
     bool geographic;
     double unit;                   /* metres in one unit of projected coordinates; 1 for geographic ones */
     double semi_major, flattening; /* of the ellipsoid, metres and 1 */
