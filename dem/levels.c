@@ -31,7 +31,7 @@ typedef struct piece_job {
     const dem_level_base *base;
     int halvings;
     tl_window part; /* in samples of the level */
-    float *piece;   /* PIECE_COLUMNS * PIECE_ROWS */
+    float *piece;   /* as many samples as a piece has at most */
     double *sums;   /* of the cells of the part */
     int64_t *counts;
 } piece_job;
@@ -120,15 +120,23 @@ static tl_status make_parts(piece_job *job, tl_window window, float *out, tl_err
     return TL_OK;
 }
 
+/* What a piece has of the base's samples one way: small windows need little memory. */
+static int64_t piece_side(int64_t most, int64_t size, int halvings)
+{
+    return size < most && halvings < 16 ? tl_int64_min(most, size << halvings) : most;
+}
+
 tl_status dem_level_read(const dem_level_base *base, int halvings, tl_window window, float *out, tl_error *error)
 {
     if (halvings == 0)
         return base->read(base->context, window, out, error);
-    size_t most = PIECE_COLUMNS * PIECE_ROWS, cells = most / 4; /* half as many either way, or one */
+    int64_t most = piece_side(PIECE_COLUMNS, window.width, halvings) * piece_side(PIECE_ROWS, window.height, halvings);
+    /* half as many either way, or one */
+    int64_t cells = tl_int64_min(PIECE_COLUMNS * PIECE_ROWS / 4, window.width * window.height);
     piece_job job = {.base = base, .halvings = halvings};
-    job.piece = tl_alloc(most, sizeof *job.piece);
-    job.sums = tl_alloc(cells, sizeof *job.sums);
-    job.counts = tl_alloc(cells, sizeof *job.counts);
+    job.piece = tl_alloc((size_t)most, sizeof *job.piece);
+    job.sums = tl_alloc((size_t)cells, sizeof *job.sums);
+    job.counts = tl_alloc((size_t)cells, sizeof *job.counts);
     tl_status status = TL_OK;
     if (!job.piece || !job.sums || !job.counts)
         status = tl_fail_memory(error, base->name);
