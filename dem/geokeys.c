@@ -1,6 +1,7 @@
 #include "dem/geokeys.h"
 
 #include "lib/base/error.h"
+#include "lib/base/number.h"
 #include "lib/base/size.h"
 
 #include <geotiff/geokeys.h>
@@ -21,6 +22,17 @@ enum {
 
 /* ---- Keys ---- */
 
+/* libgeotiff prints parameters with all their digits into buffers of 64 to 512 bytes on its stack, after multiplying
+ * them by the size of a unit. 1e15 squared has 31 digits, of which those hold what it prints; no length, angle or unit
+ * of any body is larger. */
+static bool doubles_are_sane(const double *values, size_t count)
+{
+    for (size_t k = 0; k < count; k++)
+        if (!(fabs(values[k]) <= 1e15))
+            return false;
+    return true;
+}
+
 /* Whether what an entry (key, tag that holds it, count, value or offset) points to is there. */
 static bool entry_is_sound(const dem_geokeys *keys, const uint16_t entry[4])
 {
@@ -29,7 +41,7 @@ static bool entry_is_sound(const dem_geokeys *keys, const uint16_t entry[4])
     case 0:
         return entry[2] == 1;
     case TAG_DOUBLES:
-        return end <= keys->double_count && entry[2] > 0;
+        return end <= keys->double_count && entry[2] > 0 && doubles_are_sane(keys->doubles + entry[3], entry[2]);
     case TAG_ASCII:
         return end <= keys->ascii_count;
     default: /* shorts behind the directory: no key of the standard is an array of them */
@@ -143,15 +155,6 @@ double dem_geokeys_height_unit(const dem_geokeys *keys)
 
 /* ---- Position ---- */
 
-static bool is_usable(const double t[6])
-{
-    for (int k = 0; k < 6; k++)
-        if (!isfinite(t[k]))
-            return false;
-    double determinant = t[1] * t[5] - t[2] * t[4];
-    return isfinite(determinant) && determinant != 0;
-}
-
 /* From raster coordinates (which for area rasters count from the corner of the first cell) to those of samples. */
 static void shift_to_samples(double t[6], tl_raster_type type)
 {
@@ -175,7 +178,7 @@ static bool from_scale(TIFF *tiff, double t[6])
     t[5] = -fabs(scale[1]);
     t[0] = tie[3] - tie[0] * t[1];
     t[3] = tie[4] - tie[1] * t[5];
-    return is_usable(t);
+    return tl_transform_is_usable(t);
 }
 
 static bool from_matrix(TIFF *tiff, double t[6])
@@ -186,7 +189,7 @@ static bool from_matrix(TIFF *tiff, double t[6])
         return false;
     const double transform[6] = {m[3], m[0], m[1], m[7], m[4], m[5]};
     memcpy(t, transform, sizeof transform);
-    return is_usable(t);
+    return tl_transform_is_usable(t);
 }
 
 /* Twice the signed area of the triangle of raster positions a, b, c (tie points are i, j, k, x, y, z). */
@@ -239,7 +242,7 @@ static bool from_tie_points(TIFF *tiff, double t[6])
     if (!(fabs(area(ties, b, c)) > 0))
         return false;
     through(ties, b, c, t);
-    return is_usable(t) && fits(ties, count, t);
+    return tl_transform_is_usable(t) && fits(ties, count, t);
 }
 
 bool dem_tiff_transform(TIFF *tiff, tl_raster_type type, double transform[6])

@@ -1,6 +1,7 @@
 /* EXR heightfields that talus wrote, as sources. */
 #include "dem/crs.h"
 #include "lib/base/error.h"
+#include "lib/base/number.h"
 #include "lib/base/size.h"
 #include "lib/out/out.h"
 
@@ -182,8 +183,9 @@ static tl_status read_georeference(exr_source *self, tl_error *error)
         double t[6] = {m.m[2], m.m[0], m.m[1], m.m[5], m.m[3], m.m[4]};
         t[0] += 0.5 * (t[1] + t[2]); /* from the corner of the first cell to its middle */
         t[3] += 0.5 * (t[4] + t[5]);
-        memcpy(info->georef.transform, t, sizeof t);
-        info->georef.located = true;
+        info->georef.located = tl_transform_is_usable(t);
+        if (info->georef.located)
+            memcpy(info->georef.transform, t, sizeof t);
     }
     double unit;
     if (exr_attr_get_double(self->file, PART, "talus:heightUnit", &unit) == EXR_ERR_SUCCESS && unit > 0 &&
