@@ -1,6 +1,8 @@
 #!/bin/sh
-# Installs what is missing, builds talus three times (release; address and undefined sanitizers; without SIMD) and runs every suite in both;
-# checks warnings with clang, the layers, the format and the public header. Ends with "N passed, N failed".
+# Installs what is missing, builds talus three times (release; address and undefined sanitizers; without SIMD), runs every
+# suite in each,
+# checks warnings with clang, the layers, the format and the public header, and fuzzes the readers for half a minute. Ends
+# with "N passed, N failed".
 #   tests/run.sh [FOLDER]    (default: build-tests beside the sources)
 set -eu
 here=$(cd "$(dirname "$0")/.." && pwd)
@@ -38,4 +40,8 @@ CC=clang CXX=clang++ setup "$builds/clang" --werror -Dtests=false
 clang=ok
 ninja -C "$builds/clang" --quiet || clang=failed
 
-python3 "$here/tests/summary.py" "clang warnings=$clang" "$builds"/release "$builds"/sanitize "$builds"/portable
+echo "== fuzzing, 30 s a target"
+fuzzing=ok
+"$here/tests/fuzz/run.sh" 30 "$builds/fuzz" || fuzzing=failed
+
+python3 "$here/tests/summary.py" "clang warnings=$clang" "fuzzing=$fuzzing" "$builds"/release "$builds"/sanitize "$builds"/portable
