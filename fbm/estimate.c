@@ -1,5 +1,7 @@
 #include "fbm/estimate.h"
 
+#include "fbm/elementary.h"
+
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
@@ -131,14 +133,14 @@ static stencils make_stencils(void)
 static double covariance(int i, int j, double hurst, bool area)
 {
     if (!area)
-        return -0.5 * pow(0.5 * hypot(i, j), 2 * hurst);
+        return -0.5 * fbm_pow(0.25 * (i * i + j * j), hurst);
     /* the difference of two uniform points of unit cells has the triangular density 1 - |u| */
     double sum = 0, weight = 0;
     for (int a = 0; a < CELL_STEPS; a++)
         for (int b = 0; b < CELL_STEPS; b++) {
             double u = 2 * (a + 0.5) / CELL_STEPS - 1, v = 2 * (b + 0.5) / CELL_STEPS - 1;
             double w = (1 - fabs(u)) * (1 - fabs(v));
-            sum += w * pow(0.25 * ((i + u) * (i + u) + (j + v) * (j + v)), hurst);
+            sum += w * fbm_pow(0.25 * ((i + u) * (i + u) + (j + v) * (j + v)), hurst);
             weight += w;
         }
     return -0.5 * sum / weight;

@@ -1,5 +1,7 @@
 #include "fbm/exact.h"
 
+#include "fbm/elementary.h"
+
 #include "fbm/rng.h"
 #include "fbm/weights.h"
 
@@ -61,7 +63,7 @@ static embedding plan(size_t size, double hurst)
 static double covariance(const embedding *e, double r)
 {
     if (r <= 1)
-        return e->c0 - pow(r, 2 * e->hurst) + e->c2 * r * r;
+        return e->c0 - fbm_pow(r, 2 * e->hurst) + e->c2 * r * r;
     if (r < e->reach)
         return e->b * (e->reach - r) * (e->reach - r) * (e->reach - r) / r;
     return 0;
@@ -115,8 +117,8 @@ static void transform(const complex_double *in, complex_double *out, size_t n, s
 static void make_roots(complex_double *roots, size_t n)
 {
     for (size_t k = 0; k < n; k++) {
-        double angle = 2 * acos(-1) * (double)k / (double)n;
-        roots[k] = (complex_double){cos(angle), -sin(angle)};
+        fbm_turn(k, n, &roots[k].re, &roots[k].im);
+        roots[k].im = -roots[k].im;
     }
 }
 
@@ -208,7 +210,7 @@ static void finish_field(const embedding *e, double delta, uint64_t seed, float 
     float slopes[2];
     fbm_noise_row(seed, 0, FBM_NOISE_PLANE, 0, 0, 2, slopes);
     double plane = e->radius > 0 ? sqrt(2 * e->c2) / e->radius : 0;
-    double scale = delta * pow(e->radius, e->hurst) / sqrt(2), first = (double)out[0];
+    double scale = delta * fbm_pow(e->radius, e->hurst) / sqrt(2), first = (double)out[0];
     for (size_t y = 0; y < e->size; y++)
         for (size_t x = 0; x < e->size; x++) {
             double tilt = plane * ((double)x * (double)slopes[0] + (double)y * (double)slopes[1]);

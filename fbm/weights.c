@@ -1,5 +1,7 @@
 #include "fbm/weights.h"
 
+#include "fbm/elementary.h"
+
 #include <math.h>
 #include <stddef.h>
 
@@ -130,7 +132,7 @@ static void round_predictor(const double *w, float *out)
 void fbm_weights_stationary(double hurst, fbm_weights *out)
 {
     hurst = fbm_hurst_clamp(hurst);
-    double w[4], turn = pow(2, -hurst / 2);
+    double w[4], turn = fbm_exp2(-hurst / 2);
     for (int k = 0; k < 4; k++)
         w[k] = interpolate(k, hurst);
     round_predictor(w, out->w);
@@ -144,7 +146,7 @@ void fbm_weights_stationary(double hurst, fbm_weights *out)
 void fbm_weights_square(double hurst, fbm_weights *out)
 {
     hurst = fbm_hurst_clamp(hurst);
-    double grow = pow(2, hurst);
+    double grow = fbm_exp2(hurst);
     *out = (fbm_weights){.w = {0.25F}};
     out->centre_taps[0] = (float)sqrt(1 / grow - 0.25 - grow / 8);
     out->edge_taps[0] = (float)sqrt(1 / (grow * grow) - 0.25);

@@ -1,4 +1,5 @@
 /* The fractal field over an elevation model, as a source. */
+#include "fbm/elementary.h"
 #include "fbm/estimate.h"
 #include "lib/base/error.h"
 #include "lib/base/georef.h"
@@ -361,8 +362,8 @@ static tl_status check(const tl_source *dem, const tl_field_options *o, tl_error
     const tl_source_info *info = &dem->info;
     if (o->levels < 0 || o->levels > SCENE_LEVEL_MAX)
         return tl_fail(error, TL_ERROR_ARGUMENT, "levels must be from 0 to %d, not %d", SCENE_LEVEL_MAX, o->levels);
-    if (o->hurst_given && !(o->hurst > 0 && o->hurst < 1))
-        return tl_fail(error, TL_ERROR_ARGUMENT, "the Hurst exponent must lie between 0 and 1, not at %g", o->hurst);
+    if (o->hurst_given && !(o->hurst >= FBM_HURST_MIN && o->hurst <= FBM_HURST_MAX))
+        return tl_fail(error, TL_ERROR_ARGUMENT, "the Hurst exponent must be from 0.01 to 0.99, not %g", o->hurst);
     if (o->delta_given && !(o->delta >= 0 && o->delta <= 1e30))
         return tl_fail(error, TL_ERROR_ARGUMENT, "delta must be from 0 to 1e30, not %g", o->delta);
     int64_t limit = INT64_C(1) << 60; /* coordinates of every level, and of the halo, must fit */
@@ -385,7 +386,7 @@ static void schedule(field *f, const tl_field_options *o, const tl_roughness *me
         double hurst = o->hurst_given ? o->hurst : octaves[l].hurst;
         double model = fmin(fmax(hurst, FBM_HURST_MIN), FBM_HURST_MAX);
         if (l > 0)
-            amplitude *= exp2(-hurst);
+            amplitude *= fbm_exp2(-hurst);
         if (!o->delta_given && (l == 0 || !o->hurst_given))
             amplitude = octaves[l].sigma / sqrt(fbm_detail_of_fbm(model, area));
         fbm_step *step = &f->chain.steps[l];
@@ -393,7 +394,7 @@ static void schedule(field *f, const tl_field_options *o, const tl_roughness *me
         step->amplitude = (float)amplitude;
         step->period = f->dem->info.wraps ? f->dem->info.width << l : 0;
         if (l == 0)
-            f->trend = (float)(exp2(2 * model - 1) - 1);
+            f->trend = (float)(fbm_exp2(2 * model - 1) - 1);
     }
 }
 

@@ -1,4 +1,5 @@
 /* A fractional Brownian surface as a source: an exact coarse field, refined. */
+#include "fbm/elementary.h"
 #include "fbm/exact.h"
 #include "lib/base/error.h"
 #include "lib/base/georef.h"
@@ -67,8 +68,8 @@ static tl_status check(const tl_noise_options *o, tl_error *error)
     if (o->size < 1 || o->size > INT64_C(1) << 30)
         return tl_fail(error, TL_ERROR_ARGUMENT, "the size must be from 1 to 2^30 samples, not %lld",
                        (long long)o->size);
-    if (!(o->hurst > 0 && o->hurst < 1))
-        return tl_fail(error, TL_ERROR_ARGUMENT, "the Hurst exponent must lie between 0 and 1, not at %g", o->hurst);
+    if (!(o->hurst >= FBM_HURST_MIN && o->hurst <= FBM_HURST_MAX))
+        return tl_fail(error, TL_ERROR_ARGUMENT, "the Hurst exponent must be from 0.01 to 0.99, not %g", o->hurst);
     if (!(o->delta >= 0 && o->delta <= 1e30))
         return tl_fail(error, TL_ERROR_ARGUMENT, "delta must be from 0 to 1e30, not %g", o->delta);
     return TL_OK;
@@ -77,7 +78,7 @@ static tl_status check(const tl_noise_options *o, tl_error *error)
 static tl_status make_exact(noise *n, const tl_noise_options *o, tl_error *error)
 {
     n->exact = tl_alloc_grid(n->side, n->side, sizeof *n->exact);
-    double delta = o->delta * exp2(o->hurst * n->levels); /* over one coarse sample */
+    double delta = o->delta * fbm_exp2(o->hurst * n->levels); /* over one coarse sample */
     fbm_status status = n->exact ? fbm_exact((size_t)n->side, o->hurst, delta, o->seed, n->exact) : FBM_NO_MEMORY;
     return status == FBM_OK ? TL_OK : tl_fail_memory(error, "the exact coarse field");
 }
@@ -125,7 +126,7 @@ tl_source *tl_noise_create(const tl_noise_options *o, tl_error *error)
         /* the finest step is always level -1, so that a larger surface is another one, but of the same kind */
         *step = (fbm_step){.scheme = scheme, .seed = o->seed, .level = l - n->levels};
         scheme->weights(o->hurst, &step->weights);
-        step->amplitude = (float)(o->delta * exp2(o->hurst * (n->levels - l)));
+        step->amplitude = (float)(o->delta * fbm_exp2(o->hurst * (n->levels - l)));
     }
     if (note_all(n, o, scheme, error) != TL_OK || make_exact(n, o, error) != TL_OK) {
         noise_destroy(&n->source);

@@ -1,5 +1,6 @@
 #include "lib/scene/roughness.h"
 
+#include "fbm/elementary.h"
 #include "fbm/estimate.h"
 #include "lib/base/error.h"
 #include "lib/base/parallel.h"
@@ -81,7 +82,7 @@ static tl_roughness conclude(const fbm_detail octaves[2], double quantum)
         return result;
     result.measurable = true;
     result.sigma = finest;
-    result.hurst = log2(next / finest);
+    result.hurst = fbm_log2(next / finest);
     return result;
 }
 
@@ -117,10 +118,10 @@ void scene_predict_octaves(const tl_roughness *measured, const tl_georef *georef
     double hurst = measured->hurst, sigma = measured->sigma;
     /* the measured octave's parents are two samples apart; ratios are those of metres to metres */
     double parent = 2 * sqrt(georef->cell_x * georef->cell_y);
-    double ratio = log2(sigma * georef->height_unit / parent);
+    double ratio = fbm_log2(sigma * georef->height_unit / parent);
     for (int j = 0; j < count; j++) {
         hurst += .276 * (1.191 + .266 * (ratio + 5) - hurst);
-        sigma *= exp2(-hurst);
+        sigma *= fbm_exp2(-hurst);
         ratio += 1 - hurst;
         octaves[j] = (scene_octave){.sigma = sigma, .hurst = hurst};
     }
