@@ -501,7 +501,7 @@ static void framesPlaceTheMesh(void **state)
     for (size_t k = 0; k < 3; k++) {
         out_frame *frame = out_frame_create(mesh, cases[k].kind, "test", NULL);
         assert_non_null(frame);
-        out_frame_apply(frame, mesh->vertices, mesh->vertex_count, xyz);
+        assert_int_equal(out_frame_apply(frame, mesh->vertices, mesh->vertex_count, xyz, NULL), TL_OK);
         assert_near(signed_area(mesh, xyz) / cases[k].area, 1, cases[k].tolerance);
         assert_int_equal(out_frame_faces_up(frame), cases[k].area > 0);
         out_frame_destroy(frame);
@@ -515,6 +515,28 @@ static void framesPlaceTheMesh(void **state)
     out_frame_destroy(frame);
     free(xyz);
     tl_mesh_destroy(mesh);
+}
+
+/* A hemisphere seen from above: the corners of the map show no ground. */
+static void samplesWithoutAPlaceAreTold(void **state)
+{
+    place *p = *state;
+    const char *const names[] = {"a.glb", "a.obj", "a.ply"};
+    tl_crs *crs = NULL;
+    assert_int_equal(dem_crs_from_text("+proj=ortho +lat_0=0 +lon_0=0 +R=6378137", "test", &crs, NULL), TL_OK);
+    p->source->info.georef.crs = crs;
+    const double transform[6] = {-7e6, 14e6 / WIDTH, 0, 7e6, 0, -14e6 / HEIGHT};
+    memcpy(p->source->info.georef.transform, transform, sizeof transform);
+    tl_mesh *mesh = make_mesh(p);
+    for (size_t k = 0; k < 3; k++) {
+        tl_error error;
+        assert_int_equal(tl_write_mesh(mesh, in_folder(p, names[k]), NULL, &error), TL_ERROR_DATA);
+        assert_non_null(strstr(error.text, "column 0, row 0"));
+    }
+    assert_int_equal(entries(p->folder, false), 0);
+    tl_mesh_destroy(mesh);
+    p->source->info.georef.crs = p->info.georef.crs;
+    tl_crs_release(crs);
 }
 
 static void plyHoldsTheSamples(void **state)
@@ -586,6 +608,7 @@ int main(void)
         cmocka_unit_test_setup_teardown(damagedExrIsAnError, setUp, tearDown),
         cmocka_unit_test_setup_teardown(glbHoldsWhatItsHeaderSays, setUp, tearDown),
         cmocka_unit_test_setup_teardown(framesPlaceTheMesh, setUp, tearDown),
+        cmocka_unit_test_setup_teardown(samplesWithoutAPlaceAreTold, setUp, tearDown),
         cmocka_unit_test_setup_teardown(plyHoldsTheSamples, setUp, tearDown),
         cmocka_unit_test_setup_teardown(objCountsFromOne, setUp, tearDown),
     };

@@ -13,6 +13,7 @@ const char *const out_frame_names[] = {[TL_FRAME_DEFAULT] = "default",
 
 struct out_frame {
     tl_frame kind;
+    const char *path; /* of the output, for messages */
     const tl_georef *georef;
     dem_projection *projection; /* of ENU frames */
     dem_local_frame *local;
@@ -72,6 +73,7 @@ out_frame *out_frame_create(const tl_mesh *mesh, tl_frame kind, const char *path
         return NULL;
     }
     frame->georef = &mesh->georef;
+    frame->path = path;
     if (kind == TL_FRAME_DEFAULT)
         kind = mesh->georef.crs && mesh->georef.located ? TL_FRAME_ENU : TL_FRAME_PROJECTED;
     frame->kind = kind;
@@ -111,22 +113,30 @@ bool out_frame_faces_up(const out_frame *frame)
 
 enum { BATCH = 1024 };
 
-static void apply_enu(out_frame *frame, const tl_vertex *v, size_t n, double (*xyz)[3])
+static tl_status apply_enu(out_frame *frame, const tl_vertex *v, size_t n, double (*xyz)[3], tl_error *error)
 {
     double x[BATCH], y[BATCH];
     for (size_t k = 0; k < n; k++)
         position(frame->georef, v[k].i, v[k].j, &x[k], &y[k]);
     dem_projection_to_lonlat(frame->projection, n, x, y);
-    for (size_t k = 0; k < n; k++)
+    for (size_t k = 0; k < n; k++) {
+        if (!isfinite(x[k]) || !isfinite(y[k]))
+            return tl_fail(
+                error, TL_ERROR_DATA,
+                "%s: the sample at column %d, row %d has no longitude and latitude in %s; use --frame projected",
+                frame->path, v[k].i, v[k].j, tl_crs_name(frame->georef->crs));
         dem_local_frame_forward(frame->local, x[k], y[k], (double)v[k].z * frame->georef->height_unit, xyz[k]);
+    }
+    return TL_OK;
 }
 
-void out_frame_apply(out_frame *frame, const tl_vertex *v, size_t n, double (*xyz)[3])
+tl_status out_frame_apply(out_frame *frame, const tl_vertex *v, size_t n, double (*xyz)[3], tl_error *error)
 {
+    tl_status status = TL_OK;
     if (frame->kind == TL_FRAME_ENU) {
-        for (size_t k = 0; k < n; k += BATCH)
-            apply_enu(frame, v + k, n - k < BATCH ? n - k : BATCH, xyz + k);
-        return;
+        for (size_t k = 0; k < n && status == TL_OK; k += BATCH)
+            status = apply_enu(frame, v + k, n - k < BATCH ? n - k : BATCH, xyz + k, error);
+        return status;
     }
     for (size_t k = 0; k < n; k++) {
         xyz[k][0] = v[k].i;
@@ -135,4 +145,5 @@ void out_frame_apply(out_frame *frame, const tl_vertex *v, size_t n, double (*xy
         if (frame->kind == TL_FRAME_PROJECTED)
             position(frame->georef, v[k].i, v[k].j, &xyz[k][0], &xyz[k][1]);
     }
+    return TL_OK;
 }

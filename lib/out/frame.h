@@ -13,8 +13,8 @@ void out_frame_destroy(out_frame *frame);
 tl_frame out_frame_kind(const out_frame *frame);
 /* Origin of an ENU frame: longitude, latitude in degrees, height in metres; zeros for the other frames. */
 const double *out_frame_origin(const out_frame *frame);
-/* Coordinates of n vertices. */
-void out_frame_apply(out_frame *frame, const tl_vertex *vertices, size_t n, double (*xyz)[3]);
+/* Coordinates of n vertices. TL_ERROR_DATA where one has none, as beyond the edge of a map of a hemisphere. */
+tl_status out_frame_apply(out_frame *frame, const tl_vertex *vertices, size_t n, double (*xyz)[3], tl_error *error);
 /* Whether its x and y run to the right and upwards seen from above, so that the mesh's triangles face up. */
 bool out_frame_faces_up(const out_frame *frame);
 

@@ -42,16 +42,18 @@ static void to_gltf(const double in[3], double out[3])
     out[2] = -in[1];
 }
 
-static void first_position(const tl_mesh *mesh, out_frame *frame, double origin[3])
+static tl_status first_position(const tl_mesh *mesh, out_frame *frame, double origin[3], tl_error *error)
 {
     double xyz[1][3] = {{0}};
+    tl_status status = TL_OK;
     /* a node's translation is exact in a reader that computes in double; map coordinates need it */
     if (mesh->vertex_count && out_frame_kind(frame) == TL_FRAME_PROJECTED)
-        out_frame_apply(frame, mesh->vertices, 1, xyz);
+        status = out_frame_apply(frame, mesh->vertices, 1, xyz, error);
     to_gltf(xyz[0], origin);
+    return status;
 }
 
-static void place_vertices(const tl_mesh *mesh, out_frame *frame, model *m)
+static tl_status place_vertices(const tl_mesh *mesh, out_frame *frame, model *m, tl_error *error)
 {
     double xyz[BATCH][3];
     for (int a = 0; a < 3; a++) {
@@ -60,7 +62,9 @@ static void place_vertices(const tl_mesh *mesh, out_frame *frame, model *m)
     }
     for (size_t k = 0; k < mesh->vertex_count; k += BATCH) {
         size_t n = mesh->vertex_count - k < BATCH ? mesh->vertex_count - k : BATCH;
-        out_frame_apply(frame, mesh->vertices + k, n, xyz);
+        tl_status status = out_frame_apply(frame, mesh->vertices + k, n, xyz, error);
+        if (status != TL_OK)
+            return status;
         for (size_t i = 0; i < n; i++) {
             double at[3];
             vertex placed = {{0}, {0}};
@@ -73,6 +77,7 @@ static void place_vertices(const tl_mesh *mesh, out_frame *frame, model *m)
             m->vertices[k + i] = placed;
         }
     }
+    return TL_OK;
 }
 
 /* Normals weighted by the triangles' areas. */
@@ -122,13 +127,15 @@ static tl_status build(const tl_mesh *mesh, out_frame *frame, model *m, const ch
     }
     vertex *ordered = m->vertices;
     m->vertices = placed;
-    place_vertices(mesh, frame, m);
-    add_normals(m);
+    tl_status status = place_vertices(mesh, frame, m, error);
+    if (status == TL_OK)
+        add_normals(m);
     m->vertices = ordered;
-    m->vertex_count =
-        meshopt_optimizeVertexFetch(ordered, m->indices, m->index_count, placed, m->vertex_count, sizeof *placed);
+    if (status == TL_OK)
+        m->vertex_count =
+            meshopt_optimizeVertexFetch(ordered, m->indices, m->index_count, placed, m->vertex_count, sizeof *placed);
     free(placed);
-    return TL_OK;
+    return status;
 }
 
 /* ---- JSON ---- */
@@ -243,8 +250,9 @@ tl_status out_gltf_write(const tl_mesh *mesh, tl_output *output, const tl_write_
     if (!frame)
         return status == TL_OK ? TL_ERROR_DATA : status;
     model m = {0};
-    first_position(mesh, frame, m.origin);
-    status = build(mesh, frame, &m, path, error);
+    status = first_position(mesh, frame, m.origin, error);
+    if (status == TL_OK)
+        status = build(mesh, frame, &m, path, error);
     char *json = status == TL_OK ? describe(mesh, frame, &m) : NULL;
     if (status == TL_OK)
         status = json ? write_file(&m, json, output, error) : tl_fail_memory(error, path);

@@ -34,7 +34,7 @@ static tl_status write_vertices(const tl_mesh *mesh, out_frame *frame, const tl_
     tl_status status = TL_OK;
     for (size_t k = 0; k < mesh->vertex_count && status == TL_OK; k += BATCH) {
         size_t n = mesh->vertex_count - k < BATCH ? mesh->vertex_count - k : BATCH;
-        out_frame_apply(frame, mesh->vertices + k, n, xyz);
+        status = out_frame_apply(frame, mesh->vertices + k, n, xyz, error);
         for (size_t i = 0; i < n && status == TL_OK; i++) {
             int length = snprintf(line, sizeof line, "v %.12g %.12g %.9g\n", xyz[i][0], xyz[i][1], xyz[i][2]);
             status = tl_output_append(output, line, (size_t)length, error);

@@ -38,7 +38,9 @@ static tl_status write_vertices(const tl_mesh *mesh, out_frame *frame, bool wide
     tl_status status = TL_OK;
     for (size_t k = 0; k < mesh->vertex_count && status == TL_OK; k += BATCH) {
         size_t n = mesh->vertex_count - k < BATCH ? mesh->vertex_count - k : BATCH;
-        out_frame_apply(frame, mesh->vertices + k, n, xyz);
+        status = out_frame_apply(frame, mesh->vertices + k, n, xyz, error);
+        if (status != TL_OK)
+            return status;
         float narrow[BATCH][3];
         for (size_t i = 0; i < n; i++)
             for (int a = 0; a < 3; a++)
@@ -69,7 +71,8 @@ tl_status out_ply_write(const tl_mesh *mesh, tl_output *output, const tl_write_o
     out_frame *frame = out_frame_create(mesh, options->frame, tl_output_path(output), error);
     if (!frame)
         return TL_ERROR_DATA;
-    /* 24 bits hold samples of any raster and metres of any ENU frame to a millimetre, but not a map's coordinates */
+    /* 24 bits hold a sample's column and row below 2^24, and metres of an ENU frame to 4 mm at 50 km; not a map's
+     * coordinates */
     bool wide = out_frame_kind(frame) == TL_FRAME_PROJECTED;
     tl_status status = write_header(mesh, frame, wide ? "double" : "float", output, error);
     if (status == TL_OK)
