@@ -12,13 +12,14 @@ static volatile int interrupted;
 
 static void on_signal(int number)
 {
-    interrupted = 1;
-    signal(number, SIG_DFL);
+    (void)number;
+    __atomic_store_n(&interrupted, 1, __ATOMIC_RELAXED);
 }
 
 void progress_catch_signals(void)
 {
-    struct sigaction action = {.sa_handler = on_signal};
+    struct sigaction action = {.sa_handler = on_signal,
+                               .sa_flags = (int)SA_RESETHAND}; /* a second one ends the process */
     sigemptyset(&action.sa_mask);
     sigaction(SIGINT, &action, NULL);
     sigaction(SIGTERM, &action, NULL);
@@ -28,7 +29,7 @@ void progress_catch_signals(void)
 
 bool progress_interrupted(void)
 {
-    return interrupted;
+    return __atomic_load_n(&interrupted, __ATOMIC_RELAXED);
 }
 
 double progress_clock(void)

@@ -275,6 +275,32 @@ static void existingFileIsKeptUnlessOverwriting(void **state)
     assert_int_equal(entries(f->name), 1);
 }
 
+static void replacedFileKeepsPermissionsAndLinks(void **state)
+{
+    const folder *f = *state;
+    char link_path[160], name[400], longest[256];
+    struct stat status;
+    write_text(f->path, false, "old");
+    assert_int_equal(chmod(f->path, 0600), 0);
+    snprintf(link_path, sizeof link_path, "%s/link", f->name);
+    assert_int_equal(symlink("file.bin", link_path), 0);
+    write_text(link_path, true, "newer");
+    assert_int_equal(lstat(link_path, &status), 0);
+    assert_true(S_ISLNK(status.st_mode));
+    assert_int_equal(stat(f->path, &status), 0);
+    assert_int_equal(status.st_size, 5);
+    assert_int_equal(status.st_mode & 0777, 0600);
+    unlink(link_path);
+    /* a name as long as names may be can be replaced too */
+    memset(longest, 'x', 255);
+    longest[255] = '\0';
+    snprintf(name, sizeof name, "%s/%s", f->name, longest);
+    write_text(name, false, "one");
+    write_text(name, true, "two");
+    unlink(name);
+    assert_int_equal(entries(f->name), 1);
+}
+
 static void fileThatAppearsMeanwhileIsNotReplaced(void **state)
 {
     const folder *f = *state;
@@ -390,6 +416,7 @@ int main(void)
         cmocka_unit_test_setup_teardown(outputAppearsOnlyWhenComplete, makeFolder, removeFolder),
         cmocka_unit_test_setup_teardown(abortedOutputLeavesNothing, makeFolder, removeFolder),
         cmocka_unit_test_setup_teardown(existingFileIsKeptUnlessOverwriting, makeFolder, removeFolder),
+        cmocka_unit_test_setup_teardown(replacedFileKeepsPermissionsAndLinks, makeFolder, removeFolder),
         cmocka_unit_test_setup_teardown(fileThatAppearsMeanwhileIsNotReplaced, makeFolder, removeFolder),
         cmocka_unit_test_setup_teardown(impossibleOutputsAreRefusedAtOnce, makeFolder, removeFolder),
         cmocka_unit_test(fullDiskIsTold),

@@ -23,17 +23,20 @@ struct tl_output {
     unsigned char *buffer;
 };
 
-/* ".NAME.PID-N.part" beside the path. */
+/* ".talus-PID-N.part" in the path's folder: a long name has no room for additions. */
 static void name_temporary(tl_output *output, unsigned attempt)
 {
     const char *slash = strrchr(output->path, '/');
     int folder = slash ? (int)(slash - output->path) + 1 : 0;
-    snprintf(output->temporary, strlen(output->path) + 48, "%.*s.%s.%ld-%u.part", folder, output->path,
-             output->path + folder, (long)getpid(), attempt);
+    snprintf(output->temporary, strlen(output->path) + 48, "%.*s.talus-%ld-%u.part", folder, output->path,
+             (long)getpid(), attempt);
 }
 
+/* A descriptor of a file that has no name yet, or -1, also where it could not be given one later. */
 static int open_unnamed(const char *path)
 {
+    if (access("/proc/self/fd", X_OK) != 0)
+        return -1;
     const char *slash = strrchr(path, '/');
     char *folder = slash ? strndup(path, (size_t)(slash - path) + 1) : strdup(".");
     if (!folder)
@@ -66,6 +69,26 @@ static tl_status refuse_existing(const char *path, bool overwrite, tl_error *err
     return TL_OK;
 }
 
+/* The file that `path` leads to when it is a link to one, which is then what is replaced; else the path. To be freed.
+ */
+static char *path_to_write(const char *path, bool overwrite)
+{
+    struct stat status;
+    char *target = NULL;
+    if (overwrite && lstat(path, &status) == 0 && S_ISLNK(status.st_mode))
+        target = realpath(path, NULL);
+    return target ? target : strdup(path);
+}
+
+/* A file that replaces another gets its permissions. */
+static void keep_permissions(const tl_output *output)
+{
+    struct stat status;
+    if (output->overwrite && stat(output->path, &status) == 0 && S_ISREG(status.st_mode) &&
+        fchmod(output->descriptor, status.st_mode & 0777) != 0)
+        return; /* as on file systems without permissions: those of a new file will do */
+}
+
 static void release(tl_output *output)
 {
     free(output->path);
@@ -85,8 +108,8 @@ tl_output *tl_output_open(const char *path, bool overwrite, tl_error *error)
         return NULL;
     tl_output *output = calloc(1, sizeof *output);
     if (output) {
-        output->path = strdup(path);
-        output->temporary = malloc(length + 48);
+        output->path = path_to_write(path, overwrite);
+        output->temporary = output->path ? malloc(strlen(output->path) + 48) : NULL;
         output->buffer = malloc(BUFFER_BYTES);
     }
     if (!output || !output->path || !output->temporary || !output->buffer) {
@@ -96,7 +119,7 @@ tl_output *tl_output_open(const char *path, bool overwrite, tl_error *error)
         return NULL;
     }
     output->overwrite = overwrite;
-    output->descriptor = open_unnamed(path);
+    output->descriptor = open_unnamed(output->path);
     if (output->descriptor < 0) {
         output->descriptor = open_named(output);
         output->named = output->descriptor >= 0;
@@ -174,6 +197,7 @@ static int link_unnamed(int descriptor, const char *to)
 /* Gives the file its name; 0 or an errno value. */
 static int publish(tl_output *output)
 {
+    keep_permissions(output);
     if (!output->named) {
         if (!output->overwrite)
             return link_unnamed(output->descriptor, output->path);

@@ -55,7 +55,7 @@ unsigned tl_parallel_workers(const tl_run *run, uint64_t items)
 
 static bool cancelled(const tl_run *run)
 {
-    return run && run->cancel && *run->cancel;
+    return run && run->cancel && __atomic_load_n(run->cancel, __ATOMIC_RELAXED);
 }
 
 tl_status tl_run_check(const tl_run *run, tl_error *error)
