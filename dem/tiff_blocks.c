@@ -80,16 +80,12 @@ static tl_status fail_block(const dem_blocks *blocks, const chunk *self, const d
                    (long long)self->first, dem_tiff_message(handle, "it holds too few bytes"));
 }
 
-/* Whether a block of `bytes` compressed bytes can hold what it should: a check against files of a few bytes that would
- * have gigabytes allocated. */
-static bool is_plausible(const dem_layout *layout, uint64_t bytes)
+/* Whether a block of `bytes` compressed bytes can hold the chunk: a check against files of a few bytes that would have
+ * gigabytes allocated. Small ones are left to the decoder, which tells more. */
+static bool is_plausible(const dem_layout *layout, const chunk *self, uint64_t bytes)
 {
-    int64_t expansion = dem_codec_expansion(layout->codec);
-    int64_t decoded = layout->row_bytes * layout->block_height;
-    /* the last strip of a file may hold fewer rows */
-    if (!layout->tiled)
-        decoded = layout->row_bytes * tl_int64_min(layout->block_height, layout->height);
-    return !expansion || decoded < (16 << 20) || (double)bytes * (double)expansion >= (double)decoded;
+    int64_t expansion = dem_codec_expansion(layout->codec), decoded = layout->row_bytes * self->rows;
+    return !expansion || decoded < (1 << 18) || (double)bytes * (double)expansion >= (double)decoded;
 }
 
 /* Rows of a block, each `row_bytes` long, to heights. */
@@ -128,7 +124,7 @@ static tl_status look_up_block(const dem_blocks *blocks, const chunk *self, dem_
     if (failed)
         return fail_block(blocks, self, handle, error);
     *sparse = bytes == 0;
-    if (*sparse || is_plausible(&blocks->layout, bytes))
+    if (*sparse || is_plausible(&blocks->layout, self, bytes))
         return TL_OK;
     return fail_block(blocks, self, handle, error);
 }
