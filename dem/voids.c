@@ -174,8 +174,9 @@ static void label_blocks(const void_source *v, const unsigned char *has_void, ui
     for (uint32_t b = 0; b < count; b++) {
         if (!has_void[b])
             continue;
-        if (b % columns + 1 < columns && has_void[b + 1])
-            join(labels, b, b + 1);
+        uint32_t right = b % columns + 1 < columns ? b + 1 : v->source.info.wraps ? b + 1 - columns : b;
+        if (has_void[right])
+            join(labels, b, right);
         if (b + columns < count && has_void[b + columns])
             join(labels, b, b + columns);
     }
@@ -214,19 +215,63 @@ typedef struct filling {
     const tl_run *inner; /* for the solver */
 } filling;
 
-/* The samples of a group and one more around, cut at the raster's rim. */
-static tl_window box_of(const void_source *v, const group *g)
+static bool is_of_group(const filling *f, const group *g, int64_t block)
 {
-    const tl_source_info *info = &v->source.info;
-    int64_t x0 = tl_int64_max(g->i0 * BLOCK - 1, 0), x1 = tl_int64_min(g->i1 * BLOCK + 1, info->width);
+    return f->has_void[block] && f->labels[block] == g->label;
+}
+
+/* Where the columns of blocks of a group begin and how many there are, around the globe: behind the longest run of
+ * columns without it. */
+static void columns_around(const filling *f, const group *g, int64_t *first, int64_t *count)
+{
+    int64_t columns = f->v->columns, gap = 0, longest = 0;
+    *first = 0;
+    for (int64_t step = 0; step < 2 * columns; step++) {
+        int64_t i = step % columns;
+        bool used = false;
+        for (int64_t j = g->j0; j < g->j1 && !used; j++)
+            used = is_of_group(f, g, j * columns + i);
+        if (used && gap > longest) {
+            longest = gap;
+            *first = i;
+        }
+        gap = used ? 0 : gap + 1;
+    }
+    *count = columns - longest;
+}
+
+/* The samples of a group and one more around, cut at the raster's rim. Around the globe the columns are counted on:
+ * they begin at -1 or later, and may go beyond the last one. */
+static tl_window box_of(const filling *f, const group *g)
+{
+    const tl_source_info *info = &f->v->source.info;
     int64_t y0 = tl_int64_max(g->j0 * BLOCK - 1, 0), y1 = tl_int64_min(g->j1 * BLOCK + 1, info->height);
+    int64_t x0 = tl_int64_max(g->i0 * BLOCK - 1, 0), x1 = tl_int64_min(g->i1 * BLOCK + 1, info->width);
+    if (info->wraps) {
+        int64_t first, count, last;
+        columns_around(f, g, &first, &count);
+        last = first + count; /* excluded; the raster's last column of blocks may be narrower */
+        x0 = first * BLOCK - 1;
+        x1 = (last > f->v->columns ? info->width + (last - f->v->columns) * BLOCK
+                                   : tl_int64_min(last * BLOCK, info->width)) +
+             1;
+        if (x1 - x0 >= info->width) { /* all around: the seam is cut */
+            x0 = 0;
+            x1 = info->width;
+        }
+    }
     return (tl_window){x0, y0, x1 - x0, y1 - y0};
+}
+
+static int64_t modulo(int64_t x, int64_t width)
+{
+    int64_t rest = x % width;
+    return rest < 0 ? rest + width : rest;
 }
 
 static bool belongs(const filling *f, const group *g, int64_t x, int64_t y)
 {
-    int64_t b = y / BLOCK * f->v->columns + x / BLOCK;
-    return f->has_void[b] && f->labels[b] == g->label;
+    return is_of_group(f, g, y / BLOCK * f->v->columns + modulo(x, f->v->source.info.width) / BLOCK);
 }
 
 /* Voids of other groups in the box get a height, so that nothing is solved there; no void of this group touches them.
@@ -255,7 +300,7 @@ static tl_status keep_block(const filling *f, int64_t b, tl_window box, const fl
         kept[k] = NAN;
     for (int64_t y = y0; y < y1; y++)
         for (int64_t x = x0; x < x1; x++) {
-            int64_t k = (y - box.y) * box.width + x - box.x;
+            int64_t k = (y - box.y) * box.width + modulo(x - box.x, v->source.info.width);
             if (isnan(before[k]))
                 kept[(y - y0) * BLOCK + x - x0] = after[k];
         }
@@ -270,18 +315,39 @@ static tl_status keep_group(const filling *f, const group *g, tl_window box, con
     for (int64_t j = g->j0; j < g->j1; j++)
         for (int64_t i = g->i0; i < g->i1 && status == TL_OK; i++) {
             int64_t b = j * f->v->columns + i;
-            if (f->has_void[b] && f->labels[b] == g->label)
+            if (is_of_group(f, g, b))
                 status = keep_block(f, b, box, before, after, error);
         }
     return status;
 }
 
+/* Reads a band of a box whose columns may go around. */
+static tl_status read_band(const void_source *v, tl_window band, float *out, tl_error *error)
+{
+    int64_t width = v->source.info.width;
+    for (int64_t done = 0; done < band.width;) {
+        int64_t x = modulo(band.x + done, width), part = tl_int64_min(band.width - done, width - x);
+        tl_window window = {x, band.y, part, band.height};
+        float *heights = part == band.width ? out : tl_alloc_grid(part, band.height, sizeof *heights);
+        if (!heights)
+            return tl_fail_memory(error, v->source.info.name);
+        tl_status status = read_original(v, v->source.info.level, window, heights, error);
+        for (int64_t y = 0; heights != out && status == TL_OK && y < band.height; y++)
+            memcpy(out + y * band.width + done, heights + y * part, (size_t)part * sizeof *out);
+        if (heights != out)
+            free(heights);
+        if (status != TL_OK)
+            return status;
+        done += part;
+    }
+    return TL_OK;
+}
+
 static tl_status read_box(const void_source *v, tl_window box, float *out, tl_error *error)
 {
-    for (int64_t y = 0; y < box.height;
-         y += BLOCK) { /* by bands, so that the reader's cache is not asked for a whole raster */
+    for (int64_t y = 0; y < box.height; y += BLOCK) { /* so that the reader's cache is not asked for a whole raster */
         tl_window band = {box.x, box.y + y, box.width, tl_int64_min(BLOCK, box.height - y)};
-        tl_status status = read_original(v, v->source.info.level, band, out + y * box.width, error);
+        tl_status status = read_band(v, band, out + y * box.width, error);
         if (status != TL_OK)
             return status;
     }
@@ -294,7 +360,7 @@ static tl_status fill_group(void *context, tl_parallel *loop, uint64_t item, uns
     (void)worker;
     const filling *f = context;
     const group *g = &f->groups[item];
-    tl_window box = box_of(f->v, g);
+    tl_window box = box_of(f, g);
     float *before = tl_alloc_grid(box.width, box.height, sizeof *before);
     float *after = tl_alloc_grid(box.width, box.height, sizeof *after);
     tl_status status = before && after ? read_box(f->v, box, before, error) : tl_fail_memory(error, "filling voids");
@@ -315,7 +381,7 @@ static tl_status fill_groups(const filling *f, group *groups, size_t count, cons
 {
     size_t small = 0;
     for (size_t k = 0; k < count; k++) {
-        tl_window box = box_of(f->v, &groups[k]);
+        tl_window box = box_of(f, &groups[k]);
         if (box.width * box.height < LARGE) {
             groups[small++] = groups[k];
             continue;
@@ -421,6 +487,8 @@ tl_source *tl_voids_create(const tl_source *source, const tl_void_options *optio
         .options = *o,
         .columns = columns,
         .rows = rows};
+    if (o->rule != TL_VOIDS_KEEP)
+        v->source.info.quantum = 0; /* what is filled in is no multiple of it */
     v->source.info.has_voids = o->rule != TL_VOIDS_VALUE && (source->info.has_voids || o->nodata_given);
     tl_status status = note_options(v, error);
     if (status == TL_OK && o->rule == TL_VOIDS_FILL)

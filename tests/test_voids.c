@@ -193,6 +193,39 @@ static void threadsAndWindowsDoNotMatter(void **state)
     raster_free(&r);
 }
 
+/* A hole across the seam of a raster that goes around the globe, between heights 0 and 100: a ramp. */
+static void holesJoinAroundTheGlobe(void **state)
+{
+    (void)state;
+    const int64_t widths[] = {256, 300};
+    for (size_t n = 0; n < 2; n++) {
+        int64_t width = widths[n], height = 8;
+        float *heights = tl_alloc_grid(width, height, sizeof *heights);
+        for (int64_t k = 0; k < width * height; k++) {
+            int64_t x = k % width;
+            heights[k] = x < 9 || x >= width - 10 ? NAN : x < width / 2 ? 100 : 0; /* 19 voids: 20 steps of 5 */
+        }
+        tl_source_info info = {.width = width,
+                               .height = height,
+                               .has_voids = true,
+                               .georef = tl_georef_none(),
+                               .name = "globe",
+                               .wraps = true};
+        raster r = {.width = width, .height = height, .source = tl_array_source_create(heights, &info, NULL)};
+        tl_source *full = filled(&r, NULL);
+        float *z = read_all(full);
+        for (int64_t y = 0; y < height; y++)
+            for (int64_t step = 0; step <= 20; step++) {
+                int64_t x = (width - 11 + step) % width;
+                assert_near((double)z[y * width + x], 5.0 * (double)step, 0.01);
+            }
+        free(z);
+        tl_source_destroy(full);
+        tl_source_destroy(r.source);
+        free(heights);
+    }
+}
+
 static void holesAtTheRimMeetItFlat(void **state)
 {
     (void)state;
@@ -340,6 +373,7 @@ int main(void)
         cmocka_unit_test(measuredSamplesAreKeptBitForBit),
         cmocka_unit_test(roughRimsGiveAMembrane),
         cmocka_unit_test(threadsAndWindowsDoNotMatter),
+        cmocka_unit_test(holesJoinAroundTheGlobe),
         cmocka_unit_test(holesAtTheRimMeetItFlat),
         cmocka_unit_test(linesAndSingleSamplesAreFilled),
         cmocka_unit_test(extremeHeightsStayFinite),
