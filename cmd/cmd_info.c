@@ -9,7 +9,10 @@
 typedef struct settings {
     common common;
     bool json;
+    const char *window; /* X,Y,W,H */
 } settings;
+
+enum { MAX_OVERVIEWS = 64 };
 
 typedef struct facts {
     const tl_source_info *info;
@@ -18,6 +21,14 @@ typedef struct facts {
     const tl_source *source;
     tl_range range;
     tl_roughness roughness;
+    tl_dem_size overviews[MAX_OVERVIEWS];
+    unsigned overview_count;
+    bool has_bounds;
+    double bounds[4];                    /* degrees */
+    double corner_lon[4], corner_lat[4]; /* from the first of the first row clockwise */
+    bool has_window;
+    tl_window window;
+    tl_dem_cost cost; /* of the window */
 } facts;
 
 /* CRS coordinates of the footprint: cells for area rasters, samples for points. */
@@ -58,8 +69,51 @@ static json_t *string(const char *text)
     return value;
 }
 
-static json_t *georef_json(const tl_source_info *info)
+/* Corners of the footprint, in place of sample positions; NaN where they have no longitude and latitude. */
+static void find_corners(facts *f)
 {
+    const tl_source_info *info = f->info;
+    double margin = info->type == TL_RASTER_AREA ? 0.5 : 0;
+    double right = (double)info->width - 1 + margin, bottom = (double)info->height - 1 + margin;
+    const double i[4] = {-margin, right, right, -margin}, j[4] = {-margin, -margin, bottom, bottom};
+    memcpy(f->corner_lon, i, sizeof i);
+    memcpy(f->corner_lat, j, sizeof j);
+    if (tl_georef_to_lonlat(&info->georef, 4, f->corner_lon, f->corner_lat, NULL) == TL_OK)
+        return;
+    for (int k = 0; k < 4; k++)
+        f->corner_lon[k] = f->corner_lat[k] = (double)NAN;
+}
+
+static void add_degrees(json_t *object, const facts *f)
+{
+    json_t *corners = json_array(), *bounds = f->has_bounds ? json_array() : json_null();
+    for (int k = 0; k < 4; k++) {
+        json_array_append_new(corners, json_pack("[o,o]", number(f->corner_lon[k]), number(f->corner_lat[k])));
+        if (f->has_bounds)
+            json_array_append_new(bounds, number(f->bounds[k]));
+    }
+    json_object_set_new(object, "extent_degrees", bounds);
+    json_object_set_new(object, "corners_degrees", corners);
+}
+
+static json_t *code_json(int epsg)
+{
+    return epsg ? json_integer(epsg) : json_null();
+}
+
+static json_t *crs_json(const tl_crs *crs)
+{
+    const char *vertical = tl_crs_vertical_name(crs);
+    json_t *heights =
+        !*vertical ? json_null()
+                   : json_pack("{s:o, s:o}", "name", string(vertical), "epsg", code_json(tl_crs_vertical_epsg(crs)));
+    return json_pack("{s:o, s:o, s:b, s:o, s:o}", "name", string(tl_crs_name(crs)), "epsg", code_json(tl_crs_epsg(crs)),
+                     "geographic", tl_crs_is_geographic(crs), "vertical", heights, "wkt", string(tl_crs_wkt(crs)));
+}
+
+static json_t *georef_json(const facts *f)
+{
+    const tl_source_info *info = f->info;
     const tl_georef *g = &info->georef;
     double low[2], high[2];
     extent(info, low, high);
@@ -70,23 +124,36 @@ static json_t *georef_json(const tl_source_info *info)
         json_pack("{s:b, s:o, s:[o,o,o,o], s:[o,o], s:o}", "located", g->located, "sample_transform", transform,
                   "extent", number(low[0]), number(low[1]), number(high[0]), number(high[1]), "cell_metres",
                   number(g->cell_x), number(g->cell_y), "height_unit_metres", number(g->height_unit));
-    json_t *crs = json_null();
-    if (g->crs)
-        crs = json_pack("{s:o, s:o, s:b, s:o}", "name", string(tl_crs_name(g->crs)), "epsg",
-                        tl_crs_epsg(g->crs) ? json_integer(tl_crs_epsg(g->crs)) : json_null(), "geographic",
-                        tl_crs_is_geographic(g->crs), "wkt", string(tl_crs_wkt(g->crs)));
-    json_object_set_new(object, "crs", crs);
+    add_degrees(object, f);
+    json_object_set_new(object, "crs", g->crs ? crs_json(g->crs) : json_null());
     return object;
 }
 
-static json_t *file_json(const tl_dem_details *d)
+static json_t *file_json(const facts *f)
 {
-    return json_pack("{s:s, s:s, s:i, s:s, s:[I,I], s:b, s:s, s:i, s:i, s:o, s:f, s:f, s:i, s:I}", "type",
-                     d->sample_type, "codec", d->codec, "predictor", d->predictor, "layout",
-                     d->tiled ? "tiles" : "strips", "block", (json_int_t)d->block_width, (json_int_t)d->block_height,
-                     "bigtiff", d->big_tiff, "byte_order", d->big_endian ? "big" : "little", "bands", (int)d->bands,
-                     "band", (int)d->band, "nodata", d->has_nodata ? number(d->nodata) : json_null(), "scale", d->scale,
-                     "offset", d->offset, "overviews", (int)d->overviews, "bytes", (json_int_t)d->bytes);
+    const tl_dem_details *d = &f->details;
+    json_t *sizes = json_array();
+    for (unsigned k = 0; k < f->overview_count; k++)
+        json_array_append_new(
+            sizes, json_pack("[I,I]", (json_int_t)f->overviews[k].width, (json_int_t)f->overviews[k].height));
+    json_t *object =
+        json_pack("{s:s, s:s, s:i, s:s, s:[I,I], s:b, s:s, s:i, s:i, s:o, s:f, s:f, s:i, s:I}", "type", d->sample_type,
+                  "codec", d->codec, "predictor", d->predictor, "layout", d->tiled ? "tiles" : "strips", "block",
+                  (json_int_t)d->block_width, (json_int_t)d->block_height, "bigtiff", d->big_tiff, "byte_order",
+                  d->big_endian ? "big" : "little", "bands", (int)d->bands, "band", (int)d->band, "nodata",
+                  d->has_nodata ? number(d->nodata) : json_null(), "scale", d->scale, "offset", d->offset, "overviews",
+                  (int)d->overviews, "bytes", (json_int_t)d->bytes);
+    json_object_set_new(object, "overview_sizes", sizes);
+    return object;
+}
+
+static json_t *window_json(const facts *f)
+{
+    const tl_window *w = &f->window;
+    return json_pack("{s:I, s:I, s:I, s:I, s:I, s:I, s:I}", "x", (json_int_t)w->x, "y", (json_int_t)w->y, "width",
+                     (json_int_t)w->width, "height", (json_int_t)w->height, "blocks", (json_int_t)f->cost.blocks,
+                     "stored_bytes", (json_int_t)f->cost.stored_bytes, "decoded_bytes",
+                     (json_int_t)f->cost.decoded_bytes);
 }
 
 /* The files of a mosaic; of nothing else, for one file is told of in full. */
@@ -127,10 +194,12 @@ static void print_json(const facts *f)
     json_t *object = json_pack("{s:o, s:I, s:I, s:i, s:s, s:f, s:o}", "name", string(info->name), "width",
                                (json_int_t)info->width, "height", (json_int_t)info->height, "level", info->level,
                                "raster_type", info->type == TL_RASTER_AREA ? "area" : "point", "quantum", info->quantum,
-                               "georeference", georef_json(info));
-    json_object_set_new(object, "file", f->has_details ? file_json(&f->details) : json_null());
+                               "georeference", georef_json(f));
+    json_object_set_new(object, "file", f->has_details ? file_json(f) : json_null());
     if (file_count(f))
         json_object_set_new(object, "files", files_json(f));
+    if (f->has_window)
+        json_object_set_new(object, "window", window_json(f));
     json_object_set_new(object, "heights",
                         json_pack("{s:o, s:o, s:o, s:I, s:I}", "low", number((double)f->range.low), "high",
                                   number((double)f->range.high), "mean", number(f->range.mean), "samples",
@@ -155,8 +224,18 @@ static void print_plain(const char *text)
         putchar((unsigned char)*text < 0x20 || *text == 0x7f ? '?' : *text);
 }
 
-static void print_file(const tl_dem_details *d)
+static void print_overviews(const facts *f)
 {
+    for (unsigned k = 0; k < f->overview_count; k++)
+        printf("%s%lld x %lld", k ? ", " : "overviews    ", (long long)f->overviews[k].width,
+               (long long)f->overviews[k].height);
+    if (f->overview_count)
+        putchar('\n');
+}
+
+static void print_file(const facts *f)
+{
+    const tl_dem_details *d = &f->details;
     printf("file         %lld bytes, %s%s-endian, %s, codec %s", (long long)d->bytes, d->big_tiff ? "BigTIFF, " : "",
            d->big_endian ? "big" : "little", d->sample_type, d->codec);
     if (d->predictor > 1)
@@ -165,28 +244,42 @@ static void print_file(const tl_dem_details *d)
            (long long)d->block_height);
     if (d->bands > 1)
         printf("band         %u of %u\n", d->band, d->bands);
-    if (d->overviews)
-        printf("overviews    %u\n", d->overviews);
+    print_overviews(f);
     if (d->has_nodata)
         printf("nodata       %.9g\n", d->nodata);
     if (d->scale != 1 || d->offset != 0)
         printf("heights are  %g + %g * stored\n", d->offset, d->scale);
 }
 
-static void print_place(const tl_source_info *info)
+static void print_crs(const tl_crs *crs)
 {
+    printf("CRS          ");
+    print_plain(crs ? tl_crs_name(crs) : "unknown");
+    if (crs && tl_crs_epsg(crs))
+        printf(" (EPSG:%d)", tl_crs_epsg(crs));
+    putchar('\n');
+    if (!crs || !*tl_crs_vertical_name(crs))
+        return;
+    printf("vertical     ");
+    print_plain(tl_crs_vertical_name(crs));
+    if (tl_crs_vertical_epsg(crs))
+        printf(" (EPSG:%d)", tl_crs_vertical_epsg(crs));
+    putchar('\n');
+}
+
+static void print_place(const facts *f)
+{
+    const tl_source_info *info = f->info;
     const tl_georef *g = &info->georef;
     double low[2], high[2];
     extent(info, low, high);
-    printf("CRS          ");
-    print_plain(g->crs ? tl_crs_name(g->crs) : "unknown");
-    if (g->crs && tl_crs_epsg(g->crs))
-        printf(" (EPSG:%d)", tl_crs_epsg(g->crs));
-    putchar('\n');
+    print_crs(g->crs);
     if (g->located)
         printf("extent       %.10g ... %.10g, %.10g ... %.10g\n", low[0], high[0], low[1], high[1]);
     else
         printf("extent       unknown: the file does not say where it lies\n");
+    if (f->has_bounds && !tl_crs_is_geographic(g->crs))
+        printf("degrees      %.9f ... %.9f, %.9f ... %.9f\n", f->bounds[0], f->bounds[2], f->bounds[1], f->bounds[3]);
     printf("cell         %.6g x %.6g m%s\n", g->cell_x, g->cell_y, g->crs ? "" : " (taken for metres)");
 }
 
@@ -197,23 +290,54 @@ static void print_text(const facts *f)
     printf("\nsize         %lld x %lld samples, %s\n", (long long)info->width, (long long)info->height,
            info->type == TL_RASTER_AREA ? "each the mean of its cell (area)" : "each a point");
     if (f->has_details)
-        print_file(&f->details);
+        print_file(f);
     print_files(f);
-    print_place(info);
+    print_place(f);
     const tl_range *r = &f->range;
     if (r->voids < r->samples)
         printf("heights      %.9g ... %.9g, mean %.6g", (double)r->low, (double)r->high, r->mean);
     else
         printf("heights      none: every sample is void");
     printf(info->quantum > 0 ? ", in steps of %g\n" : "\n", info->quantum);
+    if (info->georef.height_unit != 1)
+        printf("height unit  %.9g m\n", info->georef.height_unit);
     printf("voids        %llu of %llu samples (%.3g %%)\n", (unsigned long long)r->voids,
            (unsigned long long)r->samples, 100 * (double)r->voids / (double)r->samples);
     if (f->roughness.measurable)
         printf("roughness    sigma %.4g over the finest octave, exponent %.3g\n", f->roughness.sigma,
                f->roughness.hurst);
+    if (f->has_window)
+        printf("window       %llu blocks, %llu bytes in the file, %llu decoded\n", (unsigned long long)f->cost.blocks,
+               (unsigned long long)f->cost.stored_bytes, (unsigned long long)f->cost.decoded_bytes);
     for (size_t i = 0; i < info->parameter_count; i++)
         printf("%s%s: %s\n", i ? "             " : "made by      ", info->parameters[i].name,
                info->parameters[i].value);
+}
+
+/* The window that --window names; false, told, where it is none of this raster. */
+static bool parse_window(const char *text, const tl_source_info *info, tl_window *out)
+{
+    long long x, y, width, height;
+    char more;
+    if (sscanf(text, "%lld,%lld,%lld,%lld%c", &x, &y, &width, &height, &more) == 4 && x >= 0 && y >= 0 && width >= 1 &&
+        height >= 1 && x < info->width && y < info->height && width <= info->width - x && height <= info->height - y) {
+        *out = (tl_window){x, y, width, height};
+        return true;
+    }
+    complain("--window %s: is no X,Y,WIDTH,HEIGHT inside of %lld x %lld samples", text, (long long)info->width,
+             (long long)info->height);
+    return false;
+}
+
+/* All that is known without reading samples. */
+static tl_status look(facts *f, tl_error *error)
+{
+    f->has_details = tl_dem_get_details(f->source, &f->details, NULL) == TL_OK;
+    f->has_bounds = tl_source_bounds(f->info, f->bounds, NULL) == TL_OK;
+    find_corners(f);
+    if (f->has_details)
+        tl_dem_get_overviews(f->source, f->overviews, MAX_OVERVIEWS, &f->overview_count, NULL);
+    return f->has_window ? tl_dem_get_cost(f->source, f->window, &f->cost, error) : TL_OK;
 }
 
 static int inform(const settings *set, const arguments *inputs)
@@ -226,10 +350,15 @@ static int inform(const settings *set, const arguments *inputs)
     if (!source)
         return command_failed(&bar, &error);
     facts f = {.info = &source->info, .source = source};
-    f.has_details = tl_dem_get_details(source, &f.details, NULL) == TL_OK;
+    f.has_window = set->window != NULL;
+    if (set->window && !parse_window(set->window, f.info, &f.window)) {
+        progress_end(&bar);
+        command_close(&opened);
+        return EXIT_USAGE;
+    }
     int status = EXIT_DONE;
     progress_stage(&bar, "reading");
-    if (tl_source_range(source, &run, &f.range, &error) != TL_OK ||
+    if (look(&f, &error) != TL_OK || tl_source_range(source, &run, &f.range, &error) != TL_OK ||
         tl_roughness_measure(source, &run, &f.roughness, &error) != TL_OK)
         status = command_failed(&bar, &error);
     else {
@@ -245,7 +374,10 @@ static int run(const command *self, int argc, const char **argv, bool help)
 {
     settings set = {0};
     const option output[] = {
-        {"json", 'j', OPTION_FLAG, &set.json, NULL, NULL, "for machines: one JSON object", 0, 0, NULL}, {0}};
+        {"json", 'j', OPTION_FLAG, &set.json, NULL, NULL, "for machines: one JSON object", 0, 0, NULL},
+        {"window", 0, OPTION_TEXT, &set.window, NULL, "X,Y,W,H",
+         "also tell what reading this window of one file takes: first column and row, size", 0, 0, NULL},
+        {0}};
     const option input[] = {COMMON_INPUT(set.common), {0}};
     const option running[] = {COMMON_RUNNING(set.common), {0}};
     const option_group groups[] = {{"Output", output}, {"Input", input}, {"Running", running}, {0}};
@@ -258,4 +390,5 @@ static int run(const command *self, int argc, const char **argv, bool help)
     return status;
 }
 
-const command command_info = {"info", "tell what a raster holds", "RASTER... [--json]", INPUT_NOTES, run};
+const command command_info = {"info", "tell what a raster holds", "RASTER... [--json] [--window X,Y,W,H]", INPUT_NOTES,
+                              run};

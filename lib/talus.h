@@ -164,6 +164,15 @@ TL_API tl_status tl_source_validity(const tl_source *source, int level, tl_windo
                                     tl_error *error);
 TL_API void tl_source_destroy(tl_source *source);
 
+/* Sample positions (which may be fractions, and outside of the grid) to longitude, east of the CRS's own prime
+ * meridian, and latitude, in degrees on the CRS's own datum; in place, `count` points. Where there are none: NaN.
+ * TL_ERROR_DATA where CRS or place are not known. */
+TL_API tl_status tl_georef_to_lonlat(const tl_georef *georef, size_t count, double *i, double *j, tl_error *error);
+/* The box of longitudes and latitudes (as above) around a raster: west, south, east, north, of the cells of an area
+ * raster and of the samples of a point raster. West is in -180 ... 180, and east beyond 180 where the antimeridian is
+ * crossed; a raster with a pole in it goes from -180 to 180. Measured at 65 points an edge. */
+TL_API tl_status tl_source_bounds(const tl_source_info *info, double bounds[4], tl_error *error);
+
 /* A source over the caller's array of info->width * info->height heights, which must outlive it (as must
  * all that `info` points to). info->level must be 0. */
 TL_API tl_source *tl_array_source_create(const float *heights, const tl_source_info *info, tl_error *error);
@@ -235,6 +244,25 @@ typedef struct tl_dem_details {
 
 /* Details of a source that tl_dem_open made of one file; TL_ERROR_ARGUMENT for any other. */
 TL_API tl_status tl_dem_get_details(const tl_source *dem, tl_dem_details *out, tl_error *error);
+
+typedef struct tl_dem_size {
+    int64_t width, height;
+} tl_dem_size;
+
+/* Sizes of the reduced copies in the file, in its order: at most `capacity` go to `out`, and their number to *count.
+ * For the same sources as tl_dem_get_details. */
+TL_API tl_status tl_dem_get_overviews(const tl_source *dem, tl_dem_size *out, unsigned capacity, unsigned *count,
+                                      tl_error *error);
+
+/* What has to be read for a window of level 0. */
+typedef struct tl_dem_cost {
+    uint64_t blocks;        /* tiles or strips (rows of a .hgt file) that it touches */
+    uint64_t stored_bytes;  /* that they take in the file; 0 for the holes of a sparse one */
+    uint64_t decoded_bytes; /* all samples of these blocks, as the file's type */
+} tl_dem_cost;
+
+/* The cost of a window, which must lie in the grid. For the same sources as tl_dem_get_details. */
+TL_API tl_status tl_dem_get_cost(const tl_source *dem, tl_window window, tl_dem_cost *out, tl_error *error);
 
 /* Range and void share of a source's finest level, read once from end to end. */
 typedef struct tl_range {

@@ -397,6 +397,54 @@ static void cellsOfGlobalAndSenselessRastersAreFinite(void **state)
     tl_crs_release(crs);
 }
 
+/* Width x height cells from a corner of the extent; `bounds` as expected, to `tolerance` degrees. */
+static void expect_bounds(const char *text, const double corner[2], double cell, int width, int height,
+                          const double expected[4], double tolerance)
+{
+    tl_crs *crs = crs_of(text);
+    tl_source_info info = {.width = width, .height = height, .name = "raster"};
+    info.georef = (tl_georef){
+        .crs = crs, .located = true, .transform = {corner[0] + cell / 2, cell, 0, corner[1] - cell / 2, 0, -cell}};
+    double bounds[4];
+    tl_error error = {0};
+    if (tl_source_bounds(&info, bounds, &error) != TL_OK)
+        fail_msg("%s: %s", text, error.text);
+    for (int k = 0; k < 4; k++)
+        close_to(bounds[k], expected[k], tolerance);
+    tl_crs_release(crs);
+}
+
+static void boundsHoldPolesAndTheAntimeridian(void **state)
+{
+    (void)state;
+    const double up_left[2] = {-1e6, 1e6}, across[2] = {179, 1}, world[2] = {-180, 90}, turned[2] = {0, 90};
+    double south[4] = {-180, -90, 180, 0};
+    tl_crs *polar = crs_of("EPSG:3031");
+    double corner[2];
+    to_lonlat(polar, -1e6, -1e6, corner); /* of the square, the farthest from the pole */
+    south[3] = corner[1];
+    tl_crs_release(polar);
+    expect_bounds("EPSG:3031", up_left, 1e4, 200, 200, south, 1e-9);
+    expect_bounds("EPSG:4326", across, 0.5, 4, 4, (const double[]){179, -1, 181, 1}, 1e-12);
+    expect_bounds("EPSG:4326", world, 0.5, 720, 360, (const double[]){-180, -90, 180, 90}, 1e-9);
+    expect_bounds("EPSG:4326", turned, 0.5, 720, 360, (const double[]){0, -90, 360, 90}, 1e-9);
+    /* the meridian of zone 1 is at 177 degrees west; 500 km more to the west are beyond the antimeridian */
+    const double west[2] = {0, 50};
+    tl_crs *zone = crs_of("EPSG:32601");
+    double left[2], right[2];
+    to_lonlat(zone, 0, 0, left);
+    to_lonlat(zone, 1e6, 0, right);
+    close_to(left[0] - 360, -354 - right[0], 1e-9); /* symmetric about the meridian */
+    expect_bounds("EPSG:32601", west, 100, 10000, 1, (const double[]){left[0], -4.51e-4, right[0] + 360, 4.53e-4},
+                  2e-6);
+    tl_crs_release(zone);
+    tl_source_info nowhere = {.width = 1, .height = 1, .name = "raster"};
+    double bounds[4], i = 0, j = 0;
+    tl_error error = {0};
+    assert_int_equal(tl_source_bounds(&nowhere, bounds, &error), TL_ERROR_DATA);
+    assert_int_equal(tl_georef_to_lonlat(&nowhere.georef, 1, &i, &j, NULL), TL_ERROR_DATA);
+}
+
 static void projectedCellsAreColumnLengths(void **state)
 {
     (void)state;
@@ -444,6 +492,7 @@ int main(void)
         cmocka_unit_test(localFrameIsEastNorthUp),
         cmocka_unit_test(geographicCellsAreGeodesics),
         cmocka_unit_test(cellsOfGlobalAndSenselessRastersAreFinite),
+        cmocka_unit_test(boundsHoldPolesAndTheAntimeridian),
         cmocka_unit_test(projectedCellsAreColumnLengths),
     };
     return cmocka_run_group_tests(tests, make_folder, remove_folder);

@@ -384,46 +384,131 @@ def quiet_is_silent(case):
 
 # ---- info ----
 
-NUMBER = (int, float)
-SCHEMA = {
-    "name": str, "width": int, "height": int, "level": int, "raster_type": str, "quantum": NUMBER,
-    "georeference": {"located": bool, "sample_transform": [NUMBER] * 6, "extent": [NUMBER] * 4,
-                     "cell_metres": [NUMBER] * 2, "height_unit_metres": NUMBER,
-                     "crs": {"name": str, "epsg": int, "geographic": bool, "wkt": str}},
-    "file": {"type": str, "codec": str, "predictor": int, "layout": str, "block": [int] * 2, "bigtiff": bool,
-             "byte_order": str, "bands": int, "band": int, "nodata": (int, float, type(None)), "scale": NUMBER,
-             "offset": NUMBER, "overviews": int, "bytes": int},
-    "heights": {"low": NUMBER, "high": NUMBER, "mean": NUMBER, "samples": int, "voids": int},
-    "roughness": {"sigma": NUMBER, "hurst": NUMBER},
-    "parameters": dict,
-}
+TYPES = {"object": dict, "array": list, "string": str, "boolean": bool, "null": type(None), "integer": int,
+         "number": (int, float)}
+REMARKS = {"$schema", "title", "description"}
+
+
+def is_of(value, name):
+    return isinstance(value, TYPES[name]) and (name == "boolean" or not isinstance(value, bool))
+
+
+def check_object(value, schema, where):
+    for key in schema.get("required", []):
+        expect(key in value, f"{where}: no {key}")
+    for key, inner in value.items():
+        rule = schema.get("properties", {}).get(key, schema.get("additionalProperties", True))
+        expect(rule is not False, f"{where}: {key} is not in the schema")
+        if rule is not True:
+            check_schema(inner, rule, f"{where}.{key}")
 
 
 def check_schema(value, schema, where="$"):
-    if isinstance(schema, dict):
-        expect(isinstance(value, dict) and set(value) == set(schema), f"{where}: {value}")
-        for key, inner in schema.items():
-            check_schema(value[key], inner, f"{where}.{key}")
-    elif isinstance(schema, list):
-        expect(isinstance(value, list) and len(value) == len(schema), f"{where}: {value}")
-        for item, inner in zip(value, schema):
-            check_schema(item, inner, where)
-    else:
-        expect(isinstance(value, schema) and (schema is bool or not isinstance(value, bool) or schema == dict),
-               f"{where}: {value!r}")
+    """The keywords of JSON Schema that doc/info.schema.json uses, and no others."""
+    known = {"type", "enum", "minimum", "required", "properties", "additionalProperties", "items", "minItems", "maxItems"}
+    expect(not set(schema) - known - REMARKS, f"{where}: unknown keywords {set(schema) - known - REMARKS}")
+    names = schema.get("type", list(TYPES))
+    names = [names] if isinstance(names, str) else names
+    expect(any(is_of(value, name) for name in names), f"{where}: {value!r} is no {names}")
+    expect(value is None or value in schema.get("enum", [value]), f"{where}: {value!r}")
+    if isinstance(value, (int, float)):
+        expect(value >= schema.get("minimum", value), f"{where}: {value} is too small")
+    elif isinstance(value, list):
+        expect(schema.get("minItems", 0) <= len(value) <= schema.get("maxItems", len(value)), f"{where}: {value}")
+        for item in value:
+            check_schema(item, schema.get("items", {}), where + "[]")
+    elif isinstance(value, dict):
+        check_object(value, schema, where)
+
+
+def info_schema():
+    with open(os.path.join(ROOT, "doc", "info.schema.json"), encoding="utf-8") as file:
+        return json.load(file)
 
 
 def json_keeps_its_schema(case):
+    schema = info_schema()
     about = json.loads(case.run("info", EXAMPLE, "--json").out)
-    check_schema(about, SCHEMA)
+    check_schema(about, schema)
     expect((about["width"], about["height"], about["file"]["type"]) == (403, 344, "int16"), f"{about}")
+    expect("window" not in about and "files" not in about, f"{about}")
     case.run("synth", EXAMPLE, "-l", 2, "-s", 4, "-q", "-o", "a.exr")
     made = json.loads(case.run("info", "a.exr", "--json").out)
-    check_schema({**made, "file": about["file"]}, SCHEMA)
+    check_schema(made, schema)
     expect(made["file"] is None and made["level"] == 0, "an EXR is no GeoTIFF")
     expect(made["parameters"]["seed"] == "4" and made["parameters"]["levels"] == "2", f"{made['parameters']}")
     expect(all(abs(a - b) < 1e-9 for a, b in zip(made["georeference"]["extent"], about["georeference"]["extent"])),
            "the footprint has moved")
+    for options in ({"point": True}, {"holes": True}):
+        write_dem(case, "dem.tif", **options)
+        check_schema(json.loads(case.run("info", "dem.tif", "--json").out), schema)
+    values = [0.0] * 12
+    for name, x in (("b.tif", 400000), ("c.tif", 400120)):
+        write_tiff(case.path(name), 4, 3, values, False, (x, 3800000), (30, 30), 32611)
+    both = json.loads(case.run("info", "b.tif", "c.tif", "--json").out)
+    check_schema(both, schema)
+    expect(len(both["files"]) == 2 and both["file"] is None, f"{both}")
+    write_tiff(case.path("d.tif"), 4, 3, values)
+    bare = json.loads(case.run("info", "d.tif", "--json").out)
+    check_schema(bare, schema)
+    expect(bare["georeference"]["extent_degrees"] is None, f"{bare}")
+    wrong = {**about, "width": "403"}
+    for broken in (wrong, {**about, "more": 1}, {k: v for k, v in about.items() if k != "level"}):
+        try:
+            check_schema(broken, schema)
+        except AssertionError:
+            continue
+        raise AssertionError("the schema takes anything")
+
+
+def real_files_keep_the_schema(case):
+    schema = info_schema()
+    folder = shared("dem")
+    for name in ("vanderford_bathy_64m_epsg3031_cog.tif", "ahn3_wcs_data.tif", "mmgis_missionDEM.tif", "N42E001.hgt",
+                 "no_pixelscale_or_tiepoints.tiff"):
+        path = os.path.join(folder, name)
+        if os.path.exists(path):
+            about = json.loads(case.run("info", path, "--json", "--window", "0,0,1,1").out)
+            check_schema(about, schema)
+            sizes = about["file"]["overview_sizes"]
+            expect(len(sizes) == about["file"]["overviews"], f"{name}: {sizes}")
+            expect(all(a[0] > b[0] and a[1] > b[1] for a, b in zip(sizes, sizes[1:])), f"{name}: {sizes}")
+
+
+def window_costs_its_blocks(case):
+    about = json.loads(case.run("info", EXAMPLE, "--json").out)
+    width, height = about["width"], about["height"]
+    across, down = about["file"]["block"]
+    whole = json.loads(case.run("info", EXAMPLE, "--json", "--window", f"0,0,{width},{height}").out)["window"]
+    expect(whole["blocks"] == -(-width // across) * -(-height // down), f"{whole}")
+    expect(0 < whole["stored_bytes"] < about["file"]["bytes"], f"{whole}")
+    one = json.loads(case.run("info", EXAMPLE, "--json", "--window", f"{width - 1},{height - 1},1,1").out)["window"]
+    expect(one["blocks"] == 1 and one["stored_bytes"] < whole["stored_bytes"], f"{one}")
+    expect(whole["decoded_bytes"] == one["decoded_bytes"] * whole["blocks"], f"{one}")
+    for window in ("0,0,1", f"0,0,{width + 1},1", "-1,0,1,1", "0,0,0,1", "a,0,1,1", "0,0,1,1,1"):
+        case.run("info", EXAMPLE, "--window=" + window, status=2)
+
+
+def corners_agree_with_gdal(case):
+    """In degrees, where GDAL makes no change of datum of it."""
+    tool("gdalinfo")
+    folder = shared("dem")
+    compared = 0
+    for name in sorted(os.listdir(folder)):
+        path = os.path.join(folder, name)
+        if not name.endswith(".tif"):
+            continue
+        about = json.loads(case.run("info", path, "--json").out)
+        g = about["georeference"]
+        # GDAL makes cells of points, and changes the datum to WGS 84, on which these already are
+        if about["raster_type"] != "area" or not g["crs"] or "WGS 84" not in g["crs"]["name"]:
+            continue
+        ring = json.loads(gdal(case, "gdalinfo", "-json", path))["wgs84Extent"]["coordinates"][0]
+        ours = [g["corners_degrees"][k] for k in (0, 3, 2, 1)]
+        for (a, b), (c, d) in zip(ours, ring):  # GDAL prints 7 decimals
+            expect(abs(a - c) <= 0.6e-7 and abs(b - d) <= 0.6e-7, f"{name}: {ours} {ring}")
+        compared += 1
+    expect(compared, "nothing to compare")
 
 
 def names_of_any_bytes(case):
@@ -790,7 +875,8 @@ TESTS = [
     input_may_be_the_output, follows_the_umask,
     tells_a_full_stdout, tells_a_broken_pipe, closed_streams_do_not_go_into_the_output,
     bar_only_on_a_terminal, progress_lines_are_json, quiet_is_silent,
-    json_keeps_its_schema, names_of_any_bytes,
+    json_keeps_its_schema, real_files_keep_the_schema, window_costs_its_blocks, corners_agree_with_gdal,
+    names_of_any_bytes,
     formats_hold_the_same_heights, png_within_half_a_step, point_samples_are_kept, point_samples_of_the_andes_are_kept,
     area_means_stay_on_their_footprint,
     glb_is_in_metres, frames_agree, simplify_keeps_its_word,
