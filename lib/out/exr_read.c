@@ -192,10 +192,13 @@ static tl_status read_georeference(exr_source *self, tl_error *error)
         isfinite(unit))
         info->georef.height_unit = unit;
     tl_crs *crs = NULL;
-    if (wkt && dem_crs_from_text(wkt, self->path, &crs, error) != TL_OK)
-        return TL_ERROR_DATA;
+    /* a CRS that cannot be made out leaves the heights readable, as in a GeoTIFF */
+    if (wkt && dem_crs_from_text(wkt, self->path, &crs, error) == TL_ERROR_MEMORY)
+        return TL_ERROR_MEMORY;
     info->georef.crs = crs;
-    return dem_georef_measure(&info->georef, info->width, info->height, error);
+    tl_status status = dem_georef_measure(&info->georef, info->width, info->height, error);
+    info->wraps = status == TL_OK && dem_georef_goes_around(&info->georef, info->width);
+    return status;
 }
 
 static tl_status read_parameters(exr_source *self, tl_error *error)

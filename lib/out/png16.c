@@ -11,7 +11,7 @@
 #include <string.h>
 #include <unistd.h>
 
-enum { BAND_SAMPLES = 1 << 21, BAND_ROWS_MAX = 256, BAND_ROWS_MIN = 16, LEVELS = 65535 };
+enum { BAND_SAMPLES = 1 << 21, BAND_ROWS_MAX = 256, BAND_ROWS_MIN = 4, LEVELS = 65535 };
 
 /* height = offset + scale * value; value 0 is void where there are voids */
 typedef struct coding {

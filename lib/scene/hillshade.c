@@ -1,4 +1,5 @@
 /* The picture from above. */
+#include "dem/crs.h"
 #include "lib/base/error.h"
 #include "lib/base/georef.h"
 #include "lib/base/parallel.h"
@@ -107,13 +108,6 @@ static frame frame_of_two(const tl_source_info *a, const tl_source_info *b, int6
                     height ? highest : tl_int64_min(high, highest));
 }
 
-static bool same_crs(const tl_crs *a, const tl_crs *b)
-{
-    if (!a || !b)
-        return a == b;
-    return a->epsg && b->epsg ? a->epsg == b->epsg : strcmp(a->wkt, b->wkt) == 0;
-}
-
 static bool placed(const tl_georef *g)
 {
     return g->located && g->transform[2] == 0 && g->transform[4] == 0 && g->transform[1] != 0 && g->transform[5] != 0;
@@ -126,7 +120,9 @@ static scene_axis axis_beside(const scene_axis *axis, const tl_source_info *a, c
     int k = columns ? 1 : 2;
     int64_t m = columns ? a->width : a->height, n = columns ? b->width : b->height;
     double scale, offset;
-    if (placed(&a->georef) && placed(&b->georef) && same_crs(a->georef.crs, b->georef.crs)) {
+    const tl_crs *crs = a->georef.crs, *other = b->georef.crs;
+    bool same = crs && other ? dem_crs_equivalent(crs, other) : crs == other;
+    if (same && placed(&a->georef) && placed(&b->georef)) {
         scale = s[k] / t[k];
         offset = (s[0] - t[0]) / t[k];
     } else if (a->type == TL_RASTER_POINT && m > 1 && n > 1) {
