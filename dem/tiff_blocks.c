@@ -6,6 +6,7 @@
 #include "lib/base/error.h"
 #include "lib/base/size.h"
 
+#include <math.h>
 #include <string.h>
 
 struct dem_blocks {
@@ -255,14 +256,25 @@ static tl_status get_chunk(dem_blocks *blocks, const chunk *self, dem_cached_blo
     return status;
 }
 
-/* Copies what a chunk and the window share; `heights` NULL: a block that is left out, which stands for nodata or 0. */
+/* What stands in a block that is left out: nodata, as the samples' type holds it, or 0. A nodata value outside of the
+ * type is the nearest number of it, as for GDAL, and then no void. */
+static double absent_sample(const dem_layout *layout)
+{
+    if (!layout->has_nodata || layout->kind == DEM_SAMPLE_FLOAT)
+        return layout->has_nodata ? layout->nodata : 0;
+    bool has_sign = layout->kind == DEM_SAMPLE_INT;
+    double high = ldexp(1, layout->bits - has_sign) - 1, low = has_sign ? -high - 1 : 0;
+    return isnan(layout->nodata) ? 0 : fmin(fmax(round(layout->nodata), low), high);
+}
+
+/* Copies what a chunk and the window share; `heights` NULL: a block that is left out. */
 static void copy_chunk(const dem_layout *layout, const chunk *self, const float *heights, tl_window window, float *out)
 {
     int64_t left = self->column * layout->block_width;
     int64_t x0 = tl_int64_max(window.x, left), x1 = tl_int64_min(window.x + window.width, left + layout->block_width);
     int64_t y0 = tl_int64_max(window.y, self->first);
     int64_t y1 = tl_int64_min(window.y + window.height, self->first + self->rows);
-    float absent = dem_height_of(&layout->rule, layout->has_nodata ? layout->nodata : 0);
+    float absent = dem_height_of(&layout->rule, absent_sample(layout));
     for (int64_t y = y0; y < y1; y++) {
         float *row = out + (y - window.y) * window.width + (x0 - window.x);
         if (heights)
