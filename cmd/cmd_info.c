@@ -21,6 +21,8 @@ typedef struct facts {
     const tl_source *source;
     tl_range range;
     tl_roughness roughness;
+    tl_suspect suspects[TL_MAX_SUSPECTS];
+    size_t suspect_count;
     tl_dem_size overviews[MAX_OVERVIEWS];
     unsigned overview_count;
     bool has_bounds;
@@ -188,6 +190,35 @@ static void print_files(const facts *f)
                (long long)m.window.y, m.resampled ? ", interpolated" : "");
 }
 
+static json_t *suspects_json(const facts *f)
+{
+    json_t *list = json_array();
+    for (size_t k = 0; k < f->suspect_count; k++)
+        json_array_append_new(list, json_pack("{s:f, s:I}", "value", (double)f->suspects[k].value, "samples",
+                                              (json_int_t)f->suspects[k].count));
+    return list;
+}
+
+/* The fewest digits that --nodata makes the same float of. */
+static void short_float(float value, char text[32])
+{
+    for (int digits = 6; digits <= 9; digits++) {
+        snprintf(text, 32, "%.*g", digits, (double)value);
+        if (strtof(text, NULL) == value)
+            return;
+    }
+}
+
+static void print_suspects(const facts *f)
+{
+    char value[32];
+    for (size_t k = 0; k < f->suspect_count; k++) {
+        short_float(f->suspects[k].value, value);
+        printf("suspect      %s in %llu samples: perhaps void; try --nodata %s\n", value,
+               (unsigned long long)f->suspects[k].count, value);
+    }
+}
+
 static void print_json(const facts *f)
 {
     const tl_source_info *info = f->info;
@@ -204,6 +235,7 @@ static void print_json(const facts *f)
                         json_pack("{s:o, s:o, s:o, s:I, s:I}", "low", number((double)f->range.low), "high",
                                   number((double)f->range.high), "mean", number(f->range.mean), "samples",
                                   (json_int_t)f->range.samples, "voids", (json_int_t)f->range.voids));
+    json_object_set_new(object, "suspects", suspects_json(f));
     json_object_set_new(object, "roughness",
                         f->roughness.measurable
                             ? json_pack("{s:f, s:f}", "sigma", f->roughness.sigma, "hurst", f->roughness.hurst)
@@ -303,6 +335,7 @@ static void print_text(const facts *f)
         printf("height unit  %.9g m\n", info->georef.height_unit);
     printf("voids        %llu of %llu samples (%.3g %%)\n", (unsigned long long)r->voids,
            (unsigned long long)r->samples, 100 * (double)r->voids / (double)r->samples);
+    print_suspects(f);
     if (f->roughness.measurable)
         printf("roughness    sigma %.4g over the finest octave, exponent %.3g\n", f->roughness.sigma,
                f->roughness.hurst);
@@ -359,6 +392,7 @@ static int inform(const settings *set, const arguments *inputs)
     int status = EXIT_DONE;
     progress_stage(&bar, "reading");
     if (look(&f, &error) != TL_OK || tl_source_range(source, &run, &f.range, &error) != TL_OK ||
+        tl_source_suspects(source, &run, f.suspects, &f.suspect_count, &error) != TL_OK ||
         tl_roughness_measure(source, &run, &f.roughness, &error) != TL_OK)
         status = command_failed(&bar, &error);
     else {

@@ -273,6 +273,21 @@ typedef struct tl_range {
 
 TL_API tl_status tl_source_range(const tl_source *source, const tl_run *run, tl_range *out, tl_error *error);
 
+enum { TL_MAX_SUSPECTS = 4 };
+
+/* A height that probably stands for void. */
+typedef struct tl_suspect {
+    float value;
+    uint64_t count; /* samples that have it */
+} tl_suspect;
+
+/* Values at either end of a source's heights that are far from all others: those of more than 16 samples (or a
+ * ten-thousandth of all) that are farther from the next than half of the range of the rest, if the rest has at least 8
+ * different heights; and -9999, -32768 and the like, by a tenth of that range. Reads the source once. `*count` is at
+ * most TL_MAX_SUSPECTS. */
+TL_API tl_status tl_source_suspects(const tl_source *source, const tl_run *run, tl_suspect out[TL_MAX_SUSPECTS],
+                                    size_t *count, tl_error *error);
+
 /* ---- Voids -------------------------------------------------------------------------------------- */
 
 typedef enum tl_void_rule {

@@ -401,6 +401,73 @@ static void crsLivesUntilItsLastOwner(void **state)
     assert_null(tl_crs_retain(NULL));
 }
 
+/* 200 x 150 heights of 100 ... 899.9, of which every 500th is `low` and the one behind it `high`, where these are not
+ * NaN. */
+static size_t findSuspects(float low, float high, unsigned threads, tl_suspect out[TL_MAX_SUSPECTS])
+{
+    enum { WIDTH = 200, HEIGHT = 150 };
+    static float heights[WIDTH * HEIGHT];
+    for (int k = 0; k < WIDTH * HEIGHT; k++) {
+        heights[k] = 100 + (float)(k * 7919 % 8000) / 10;
+        if (k % 500 == 0 && !isnan(low))
+            heights[k] = low;
+        if (k % 500 == 1 && !isnan(high))
+            heights[k] = high;
+    }
+    heights[17] = NAN;
+    tl_source_info info = {.width = WIDTH, .height = HEIGHT, .name = "heights", .georef = tl_georef_none()};
+    tl_source *source = tl_array_source_create(heights, &info, NULL);
+    const tl_run run = {.threads = threads};
+    size_t count = 99;
+    assert_int_equal(tl_source_suspects(source, &run, out, &count, NULL), TL_OK);
+    tl_source_destroy(source);
+    return count;
+}
+
+static void lonelyHeightsAreSuspects(void **state)
+{
+    (void)state;
+    /* the rest has a range of 799.9: a value with a name must be 80 away, one without 400 */
+    static const struct {
+        float low, high;
+        size_t count;
+    } cases[] = {{NAN, NAN, 0},  {-9999, NAN, 1}, {NAN, 32767, 1}, {-9999, 65535, 2}, {-1e37f, 3.4028235e38f, 2},
+                 {-310, NAN, 1}, {-290, NAN, 0},  {NAN, 1310, 1},  {NAN, 1290, 0},    {-32768, 1e6f, 2},
+                 {0, NAN, 0}};
+    for (size_t k = 0; k < sizeof cases / sizeof *cases; k++) {
+        tl_suspect found[TL_MAX_SUSPECTS];
+        assert_int_equal(findSuspects(cases[k].low, cases[k].high, 2, found), cases[k].count);
+        for (size_t i = 0; i < cases[k].count; i++) {
+            assert_true(found[i].value == cases[k].low || found[i].value == cases[k].high);
+            assert_int_equal(found[i].count, 60);
+        }
+    }
+}
+
+static void suspectsNeedARest(void **state)
+{
+    (void)state;
+    static const struct {
+        float heights[6];
+        size_t count;
+    } cases[] = {{{0, 1, 0, 1, 0, 1}, 0},
+                 {{5, 5, 5, 5, 5, 5}, 0},
+                 {{NAN, NAN, NAN, NAN, NAN, NAN}, 0},
+                 {{-9999, 5, 5, 5, 5, 5}, 1},
+                 {{-9999, -9999, NAN, NAN, NAN, NAN}, 0},
+                 {{-9999, 7, 7, 8, 65535, 9}, 2},
+                 {{0, 1, 2, 3, 4, 900}, 0}};
+    tl_source_info info = {.width = 3, .height = 2, .name = "six", .georef = tl_georef_none()};
+    for (size_t k = 0; k < sizeof cases / sizeof *cases; k++) {
+        tl_source *source = tl_array_source_create(cases[k].heights, &info, NULL);
+        tl_suspect found[TL_MAX_SUSPECTS];
+        size_t count = 99;
+        assert_int_equal(tl_source_suspects(source, NULL, found, &count, NULL), TL_OK);
+        assert_int_equal(count, cases[k].count);
+        tl_source_destroy(source);
+    }
+}
+
 int main(void)
 {
     const struct CMUnitTest tests[] = {
@@ -423,6 +490,8 @@ int main(void)
         cmocka_unit_test(arraySourceReadsWindows),
         cmocka_unit_test(meshKeepsItsParameters),
         cmocka_unit_test(crsLivesUntilItsLastOwner),
+        cmocka_unit_test(lonelyHeightsAreSuspects),
+        cmocka_unit_test(suspectsNeedARest),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }
