@@ -33,7 +33,7 @@ static int write_and_check(const settings *set, const tl_source *dem, const tl_m
     tl_error error;
     tl_mesh_report check = {0};
     progress_stage(bar, "verifying");
-    if (set->verify && tl_mesh_verify(mesh, dem, run, &check, &error) != TL_OK)
+    if (set->verify && tl_mesh_verify_in(mesh, dem, (tl_frame)set->frame, run, &check, &error) != TL_OK)
         return command_failed(bar, &error);
     progress_end(bar);
     int status = set->verify ? report_check(set, &check) : EXIT_DONE;
@@ -74,7 +74,7 @@ static int simplify(const settings *set, const arguments *inputs)
     if (!dem)
         return command_failed(&bar, &error);
     progress_stage(&bar, "simplifying");
-    tl_framework_options options = {.max_error = set->max_error, .run = &run};
+    tl_framework_options options = {.max_error = set->max_error, .run = &run, .frame = (tl_frame)set->frame};
     tl_framework *framework = tl_framework_build(dem, &options, &error);
     tl_mesh *mesh = NULL;
     int status = EXIT_DONE;

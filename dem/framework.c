@@ -1,5 +1,7 @@
 #include "dem/framework.h"
 
+#include "dem/bend.h"
+
 #include "lib/base/error.h"
 #include "lib/base/georef.h"
 #include "lib/base/parallel.h"
@@ -15,7 +17,8 @@ enum { READ_ROWS = 256 };
 typedef struct findings {
     float magnitude; /* largest |height| */
     bool voids;
-    bool rounds; /* the heights are not exact in double arithmetic over the whole lattice */
+    bool rounds;   /* the heights are not exact in double arithmetic over the whole lattice */
+    dem_bend bend; /* where the frame bends */
 } findings;
 
 typedef struct builder {
@@ -29,6 +32,9 @@ typedef struct builder {
     float *centres;          /* bounds of the blocks' own centres: where the top begins */
     struct scratch *scratch; /* by worker */
     unsigned workers;
+    double top;             /* the highest sample or 0, metres; where the frame bends */
+    double rises[TL_SIZES]; /* of triangles and their neighbours, metres in a cell; where the frame bends */
+    dem_space **spaces;     /* by worker, likewise */
 } builder;
 
 /* ---- Progress over several loops ----------------------------------------------------------------- */
@@ -250,6 +256,26 @@ static void store_block(const builder *self, const tl_patch *patch, uint64_t blo
     }
 }
 
+/* What triangles' errors may reach on a lattice that is bent like this. */
+static void fill_limits(const builder *self, const dem_bend *bend, double limit[TL_SIZES])
+{
+    const tl_framework *framework = self->framework;
+    for (int size = 0; size < TL_SIZES; size++)
+        limit[size] = framework->max_error;
+    for (int size = 1; framework->bends && size < TL_SIZES; size++)
+        limit[size] -= dem_bend_error(bend, ldexp(1, size + 1), self->rises[size]) / framework->info.georef.height_unit;
+}
+
+static dem_bend set_limits(const builder *self, tl_patch *patch, unsigned worker)
+{
+    dem_bend bend = {0};
+    if (self->framework->bends)
+        bend = dem_space_bend(self->spaces[worker], (double)patch->x, (double)patch->y, (double)patch->width,
+                              (double)patch->height, self->top);
+    fill_limits(self, &bend, patch->limit);
+    return bend;
+}
+
 static void decide_block(const tl_patch *patch, int64_t side, bool voids, void *rows)
 {
     tl_patch_decide_samples(patch, voids, rows);
@@ -282,7 +308,6 @@ static tl_status run_block(void *context, tl_parallel *loop, uint64_t item, unsi
                       .split = own->split + frame + 1,
                       .x = column * side,
                       .y = row * side,
-                      .max_error = framework->max_error,
                       .centres = own->centres,
                       .across = own->across,
                       .down = own->down};
@@ -296,7 +321,8 @@ static tl_status run_block(void *context, tl_parallel *loop, uint64_t item, unsi
     int block_log = framework->lattice_log < TL_BLOCK_LOG ? framework->lattice_log : TL_BLOCK_LOG;
     self->found[item] = inspect_block(&patch, &rounding, block_log, framework->lattice_log);
     patch.careful = rounding > 0;
-    patch.sum_limit = framework->max_error - rounding;
+    patch.rounding = rounding;
+    self->found[item].bend = set_limits(self, &patch, worker);
     if (side > 1)
         decide_block(&patch, side, self->found[item].voids, own->rows);
     store_block(self, &patch, item);
@@ -443,11 +469,10 @@ static tl_status run_top(builder *self, const tl_run *run, tl_error *error)
                       .rim_x = self->width - 1,
                       .rim_y = self->height - 1,
                       .split_log = TL_BLOCK_LOG,
-                      .max_error = framework->max_error,
                       .centres = self->centres,
                       .careful = self->all.rounds};
-    double rounding = self->all.rounds ? tl_plane_rounding((double)self->all.magnitude) : 0;
-    patch.sum_limit = framework->max_error - rounding;
+    patch.rounding = self->all.rounds ? tl_plane_rounding((double)self->all.magnitude) : 0;
+    fill_limits(self, &self->all.bend, patch.limit);
     patch.split_stride = (patch.width >> TL_BLOCK_LOG) + 1;
     int64_t columns = tl_patch_squares(patch.width, framework->block);
     int64_t rows = tl_patch_squares(patch.height, framework->block);
@@ -470,6 +495,39 @@ static tl_status run_top(builder *self, const tl_run *run, tl_error *error)
 
 /* ---- Building -------------------------------------------------------------------------------------- */
 
+static void free_spaces(builder *self)
+{
+    for (unsigned i = 0; self->spaces && i < self->workers; i++)
+        dem_space_destroy(self->spaces[i]);
+    free(self->spaces);
+}
+
+/* What the limits of a bent frame are made of. A sample is shifted over a triangle's own slope or that of the triangle
+ * on the other side of one of its edges, which is of the same size or of the next. */
+static tl_status look_at_frame(builder *self, const tl_run *run, tl_error *error)
+{
+    const tl_framework *framework = self->framework;
+    const tl_source_info *info = &framework->info;
+    double own[TL_SIZES + 1] = {0}, unit = info->georef.height_unit;
+    self->spaces = calloc(self->workers, sizeof(dem_space *));
+    if (!self->spaces)
+        return tl_fail_memory(error, "the framework");
+    for (unsigned i = 0; i < self->workers; i++) {
+        self->spaces[i] = dem_space_create(&info->georef, self->width, self->height, info->name, error);
+        if (!self->spaces[i])
+            return TL_ERROR_DATA;
+    }
+    tl_status status =
+        tl_framework_rises(self->heights, self->width, self->height, framework->lattice_log, run, own, error);
+    for (int size = 1; size < TL_SIZES; size++)
+        self->rises[size] = unit * fmax(own[size], fmax(own[size - 1], own[size + 1]));
+    float top = 0;
+    for (int64_t i = 0; i < self->width * self->height; i++)
+        top = self->heights[i] > top ? self->heights[i] : top; /* false for a void */
+    self->top = unit * (double)top;
+    return status;
+}
+
 static tl_status decide_blocks(builder *self, const tl_run *run, tl_error *error)
 {
     tl_framework *framework = self->framework;
@@ -484,6 +542,8 @@ static tl_status decide_blocks(builder *self, const tl_run *run, tl_error *error
         self->centres[i] = -INFINITY;
     self->workers = tl_parallel_workers(run, blocks);
     tl_status status = make_scratch(self, error);
+    if (status == TL_OK && framework->bends)
+        status = look_at_frame(self, run, error);
     if (status == TL_OK)
         status = tl_parallel_for(run, blocks, (uint64_t)self->width * (uint64_t)self->height, run_block, self, error);
     for (size_t i = 0; status == TL_OK && i < blocks; i++) {
@@ -491,6 +551,7 @@ static tl_status decide_blocks(builder *self, const tl_run *run, tl_error *error
             self->all.magnitude = self->found[i].magnitude;
         self->all.voids |= self->found[i].voids;
         self->all.rounds |= self->found[i].rounds;
+        self->all.bend = i ? dem_bend_worse(self->all.bend, self->found[i].bend) : self->found[i].bend;
     }
     return status;
 }
@@ -568,6 +629,7 @@ tl_framework *tl_framework_build(const tl_source *dem, const tl_framework_option
         return NULL;
     }
     framework->max_error = options->max_error;
+    framework->bends = dem_frame_bends(&dem->info.georef, options->frame);
     framework->threads = options->run ? options->run->threads : 0;
     builder self = {.framework = framework, .dem = dem, .width = dem->info.width, .height = dem->info.height};
     tl_status status = copy_info(framework, &dem->info, error);
@@ -580,6 +642,7 @@ tl_framework *tl_framework_build(const tl_source *dem, const tl_framework_option
     free(self.borders);
     free(self.centres);
     free_scratch(&self);
+    free_spaces(&self);
     if (status == TL_OK)
         return framework;
     tl_framework_destroy(framework);

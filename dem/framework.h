@@ -20,6 +20,7 @@ enum { TL_BLOCK_LOG = 8, TL_BLOCK = 1 << TL_BLOCK_LOG };
 struct tl_framework {
     tl_source_info info; /* of the DEM; what it points to is the framework's own */
     double max_error;
+    bool bends; /* the bound holds in a frame where the lattice is bent */
     unsigned threads;
     int lattice_log; /* k */
     int64_t block; /* side of the squares that are decided alone: TL_BLOCK, or the whole lattice where it is smaller */
@@ -42,6 +43,18 @@ static inline void tl_bit_set(uint64_t *bits, size_t words, int64_t x, int64_t y
     bits[(size_t)y * words + (size_t)(x >> 6)] |= UINT64_C(1) << (x & 63);
 }
 
+/* Sizes of triangles, from 1: those that edge points of stage 1 split (hypotenuse 2), centres of stage 1 (hypotenuse
+ * 2 sqrt 2), edge points of stage 2, and so on: the square of the hypotenuse is 2^(size + 1). Size 0 is half a cell. */
+enum { TL_SIZES = 2 * 32 + 1 };
+static inline int tl_size_of(int64_t s, bool centre)
+{
+    return 2 * __builtin_ctzll((unsigned long long)s) + 1 + centre;
+}
+
+/* The largest rise over one cell, in units of height, of any triangle of each size (but those with voids). */
+tl_status tl_framework_rises(const float *heights, int64_t width, int64_t height, int lattice_log, const tl_run *run,
+                             double rises[TL_SIZES], tl_error *error);
+
 /* Fills in `points`, their number, rank and heights, and the number of isolated samples, from `split` and the DEM's
  * heights (width * height, NaN for voids). */
 tl_status tl_framework_find_points(tl_framework *framework, const float *dem, const tl_run *run, tl_error *error);
@@ -56,9 +69,11 @@ typedef struct tl_patch {
     unsigned char *split;  /* one byte for every vertex at multiples of 2^split_log: set where needed */
     int64_t split_stride;
     int split_log;
-    double max_error;
-    double sum_limit; /* what the nested sum may reach: max_error less the rounding of the whole patch */
-    bool careful;     /* double arithmetic rounds on these heights: add its bound to every error */
+    /* What the error of a triangle may reach, by its size: see tl_size_of. In flat frames max_error for all, in bent
+     * ones less what a triangle of that size is away from the lattice; below 0 it must be split. */
+    double limit[TL_SIZES];
+    double rounding; /* of the whole patch: what the nested sum must stay below its limit by */
+    bool careful;    /* double arithmetic rounds on these heights: add its bound to every error */
     /* Bounds of the error of the triangles that a vertex splits: infinite where it is needed, -infinite where all is
      * void or outside. Of centres (with a neutral frame), of horizontal and of vertical edge points. */
     float *centres, *across, *down;

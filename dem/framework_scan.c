@@ -145,12 +145,12 @@ static inline double midpoint_error(double a, double z, double b, bool careful)
 }
 
 /* The bound after a scan. */
-static float scanned(const scan *from, double max_error)
+static float scanned(const scan *from)
 {
     double error = from->error;
     if (from->careful)
         error += tl_plane_rounding(from->magnitude);
-    return settled(error, max_error);
+    return settled(error, from->limit);
 }
 
 static inline void mark(const tl_patch *patch, int64_t x, int64_t y)
@@ -160,20 +160,20 @@ static inline void mark(const tl_patch *patch, int64_t x, int64_t y)
 
 /* What can be said of a vertex z between a and b whose children have at most the bound `children`, without a scan:
  * its own bound, NEEDED, NOTHING, or NAN where only a scan can tell. */
-static inline float staged(const tl_patch *patch, float children, double a, double z, double b)
+static inline float staged(const tl_patch *patch, double limit, float children, double a, double z, double b)
 {
     if (isinf(children))
         return children;
     double error = fabs(z - 0.5 * (a + b)), sum = error + (double)children;
-    if (sum <= patch->sum_limit ||
-        (sum == 0 && a == b)) /* the latter: children of bound 0 are flat where rounding counts */
+    if (sum <= limit - patch->rounding ||
+        (sum == 0 && a == b && limit >= 0)) /* the latter: children of bound 0 are flat where rounding counts */
         return rounded_up(sum);
-    return error <= patch->max_error ? NAN : NEEDED;
+    return error <= limit ? NAN : NEEDED;
 }
 
-static scan new_scan(const tl_patch *patch)
+static scan new_scan(const tl_patch *patch, double limit)
 {
-    return (scan){.stride = patch->stride, .limit = patch->max_error, .careful = patch->careful};
+    return (scan){.stride = patch->stride, .limit = limit, .careful = patch->careful};
 }
 
 /* Whether the triangle below (or right of) an edge at `at` reaches over the rim; one that begins there is outside. */
@@ -190,15 +190,16 @@ static float decide_across(const tl_patch *patch, int64_t x, int64_t y, int64_t 
     if (x + s > patch->rim_x || reaches_over(y, s, patch->rim_y))
         return NEEDED;
     const float *z = patch->heights + y * patch->stride + x;
-    float bound = staged(patch, children, (double)z[-s], (double)z[0], (double)z[s]);
+    double limit = patch->limit[tl_size_of(s, false)];
+    float bound = staged(patch, limit, children, (double)z[-s], (double)z[0], (double)z[s]);
     if (!isnan(bound))
         return bound;
-    scan to = new_scan(patch);
+    scan to = new_scan(patch, limit);
     if (y > 0)
         scan_across(&to, z, s, -patch->stride);
     if (y < patch->height && y < patch->rim_y)
         scan_across(&to, z, s, patch->stride);
-    return scanned(&to, patch->max_error);
+    return scanned(&to);
 }
 
 /* The vertical edge point (x, y) of stage s. */
@@ -210,12 +211,13 @@ static float decide_down(const tl_patch *patch, int64_t x, int64_t y, int64_t s,
         return NEEDED;
     const float *z = patch->heights + y * patch->stride + x;
     int64_t below = s * patch->stride;
-    float bound = staged(patch, children, (double)z[-below], (double)z[0], (double)z[below]);
+    double limit = patch->limit[tl_size_of(s, false)];
+    float bound = staged(patch, limit, children, (double)z[-below], (double)z[0], (double)z[below]);
     if (!isnan(bound))
         return bound;
-    scan to = new_scan(patch);
+    scan to = new_scan(patch, limit);
     scan_down(&to, z, s, x > 0, x < patch->width && x < patch->rim_x);
-    return scanned(&to, patch->max_error);
+    return scanned(&to);
 }
 
 /* Whether the square (column, row) of side 2 s of the patch is cut by '/'. */
@@ -231,16 +233,17 @@ static float decide_centre(const tl_patch *patch, int64_t x, int64_t y, int64_t 
         return NEEDED;
     const float *z = patch->heights + y * patch->stride + x;
     int64_t end = s * patch->stride + (rising ? -s : s);
-    float bound = staged(patch, children, (double)z[-end], (double)z[0], (double)z[end]);
+    double limit = patch->limit[tl_size_of(s, true)];
+    float bound = staged(patch, limit, children, (double)z[-end], (double)z[0], (double)z[end]);
     if (!isnan(bound))
         return bound;
-    scan to = new_scan(patch);
+    scan to = new_scan(patch, limit);
     const float *first = z - s * patch->stride - s;
     if (rising)
         scan_rising(&to, first, 2 * s);
     else
         scan_falling(&to, first, 2 * s);
-    return scanned(&to, patch->max_error);
+    return scanned(&to);
 }
 
 void tl_patch_decide_edges(const tl_patch *patch, int64_t s, int64_t row)
@@ -338,7 +341,7 @@ static inline void sample_edges(const sampler *self, const float *restrict a, co
                                 const float *restrict b, const float *restrict c, const float *restrict d,
                                 double *restrict out, int64_t count)
 {
-    double limit = self->patch->max_error;
+    double limit = self->patch->limit[tl_size_of(1, false)];
     for (int64_t i = 0; i < count; i++) {
         double error = midpoint_error((double)a[i], (double)z[i], (double)b[i], self->careful);
         out[i] = error <= limit ? error : HUGE_VAL;
@@ -391,12 +394,13 @@ static inline void sample_centres(const sampler *self, int64_t row, const double
     const tl_patch *patch = self->patch;
     parted north = part_of(self, 2 * row), here = part_of(self, 2 * row + 1), south = part_of(self, 2 * row + 2);
     int64_t rising = is_rising(patch, 0, row, 1);
+    double limit = patch->limit[tl_size_of(1, true)];
     for (int64_t i = 0; i < self->columns; i++) {
         int64_t turned = (i + rising) & 1;
         double error = midpoint_error((double)north.even[i + turned], (double)here.odd[i],
                                       (double)south.even[i + 1 - turned], self->careful);
         double most = larger(larger(above[i], below[i]), larger(down[i], down[i + 1]));
-        float bound = settled(larger(error, most), patch->max_error);
+        float bound = settled(larger(error, most), limit);
         out[i] = self->voids && most == -HUGE_VAL ? NOTHING : bound;
     }
     if (2 * self->columns > patch->rim_x)

@@ -1,5 +1,6 @@
 /* The check on meshes: every triangle over every sample that it covers, whatever made them. It knows nothing of the
  * framework, so that neither can hide the other's mistakes. */
+#include "dem/bend.h"
 #include "lib/base/error.h"
 #include "lib/base/parallel.h"
 #include "lib/base/size.h"
@@ -17,6 +18,11 @@ typedef struct band_result {
     uint64_t samples, uncovered;
 } band_result;
 
+/* A sample in space: where its ground is, and which way is up there. */
+typedef struct place {
+    double at[3], up[3];
+} place;
+
 typedef struct verifier {
     const tl_mesh *mesh;
     const tl_source *source;
@@ -27,6 +33,11 @@ typedef struct verifier {
     float **heights;      /* by worker: the band's samples */
     double **errors;      /* and the largest error of each, negative where no triangle covers it */
     band_result *results; /* by band */
+    bool bent;            /* the rest is for frames where the lattice is bent: */
+    place *corners;       /* of the mesh, by vertex; only `at` */
+    place **places;       /* by worker: the band's samples */
+    double **beside;      /* and the error of each on the lattice's triangle, for those beside all flat ones */
+    dem_space **spaces;   /* by worker */
 } verifier;
 
 static const tl_vertex *corner(const verifier *self, size_t triangle, int k)
@@ -110,6 +121,134 @@ static void compare_triangle(const verifier *self, size_t triangle, int64_t top,
     }
 }
 
+/* ---- One flat triangle over a bent lattice ---------------------------------------------------------- */
+
+static inline double dot(const double a[3], const double b[3])
+{
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+}
+
+static inline void minus(const double a[3], const double b[3], double out[3])
+{
+    for (int k = 0; k < 3; k++)
+        out[k] = a[k] - b[k];
+}
+
+static inline void cross(const double a[3], const double b[3], double out[3])
+{
+    out[0] = a[1] * b[2] - a[2] * b[1];
+    out[1] = a[2] * b[0] - a[0] * b[2];
+    out[2] = a[0] * b[1] - a[1] * b[0];
+}
+
+/* How far a triangle reaches beyond its box on the lattice. A row that is bent at all is so by less than this share of
+ * the triangle, and samples of small ones are not near enough to an edge for it to pass them. */
+static int64_t reach(const tl_vertex *const v[3])
+{
+    int64_t x =
+        tl_int64_max(tl_int64_max(v[0]->i, v[1]->i), v[2]->i) - tl_int64_min(tl_int64_min(v[0]->i, v[1]->i), v[2]->i);
+    int64_t y =
+        tl_int64_max(tl_int64_max(v[0]->j, v[1]->j), v[2]->j) - tl_int64_min(tl_int64_min(v[0]->j, v[1]->j), v[2]->j);
+    return tl_int64_max(x, y) / 64;
+}
+
+/* Metres from a sample to the triangle's plane upwards; *inside tells whether it is met in the triangle. */
+static double distance_up(const double *const c[3], const double normal[3], const place *from, bool *inside)
+{
+    double to[3][3], side[3];
+    for (int k = 0; k < 3; k++)
+        minus(c[k], from->at, to[k]);
+    double up = dot(normal, to[0]) / dot(normal, from->up);
+    for (int k = 0; k < 3; k++)
+        for (int a = 0; a < 3; a++)
+            to[k][a] -= up * from->up[a];
+    *inside = true;
+    for (int k = 0; k < 3; k++) {
+        cross(to[k], to[(k + 1) % 3], side);
+        *inside = *inside && dot(side, normal) >= 0;
+    }
+    return up;
+}
+
+/* Whether the sample (x, y) is in the triangle on the lattice. */
+static bool covers(const tl_vertex *const v[3], int64_t x, int64_t y)
+{
+    int64_t a = area(v[0], v[1], x, y), b = area(v[1], v[2], x, y), c = area(v[2], v[0], x, y);
+    return (a >= 0 && b >= 0 && c >= 0) || (a <= 0 && b <= 0 && c <= 0);
+}
+
+typedef struct bent_band {
+    int64_t top, bottom;
+    const float *heights;
+    const place *places;
+    double *errors, *beside;
+} bent_band;
+
+static void compare_place(const verifier *self, const tl_vertex *const v[3], const double *const c[3],
+                          const double normal[3], int64_t x, int64_t y, const bent_band *band)
+{
+    int64_t at = (y - band->top) * self->width + x;
+    if (!(fabsf(band->heights[at]) <= FLT_MAX))
+        return;
+    for (int k = 0; k < 3; k++)
+        if (v[k]->i == x && v[k]->j == y) { /* not by way of rounded places */
+            note(&band->errors[at], fabs((double)v[k]->z - (double)band->heights[at]));
+            return;
+        }
+    bool inside;
+    double up = distance_up(c, normal, &band->places[at], &inside) / self->source->info.georef.height_unit;
+    if (inside || isnan(up))
+        note(&band->errors[at], fabs(up));
+    else if (covers(v, x, y))
+        note(&band->beside[at], fabs(up));
+}
+
+static void compare_bent(const verifier *self, size_t triangle, const bent_band *band)
+{
+    const tl_vertex *v[3];
+    const double *c[3];
+    for (int k = 0; k < 3; k++) {
+        v[k] = corner(self, triangle, k);
+        c[k] = self->corners[v[k] - self->mesh->vertices].at;
+    }
+    if (area(v[0], v[1], v[2]->i, v[2]->j) == 0)
+        return;
+    double ab[3], ac[3], normal[3];
+    minus(c[1], c[0], ab);
+    minus(c[2], c[0], ac);
+    cross(ab, ac, normal);
+    int64_t pad = reach(v);
+    int64_t x0 = tl_int64_max(tl_int64_min(tl_int64_min(v[0]->i, v[1]->i), v[2]->i) - pad, 0);
+    int64_t x1 = tl_int64_min(tl_int64_max(tl_int64_max(v[0]->i, v[1]->i), v[2]->i) + pad, self->width - 1);
+    int64_t y0 = tl_int64_max(tl_int64_min(tl_int64_min(v[0]->j, v[1]->j), v[2]->j) - pad, band->top);
+    int64_t y1 = tl_int64_min(tl_int64_max(tl_int64_max(v[0]->j, v[1]->j), v[2]->j) + pad, band->bottom);
+    for (int64_t y = y0; y <= y1; y++)
+        for (int64_t x = x0; x <= x1; x++)
+            compare_place(self, v, c, normal, x, y, band);
+}
+
+static void compare_bent_band(const verifier *self, size_t item, unsigned worker, int64_t top, int64_t rows)
+{
+    bent_band band = {.top = top,
+                      .bottom = top + rows - 1,
+                      .heights = self->heights[worker],
+                      .places = self->places[worker],
+                      .errors = self->errors[worker],
+                      .beside = self->beside[worker]};
+    double unit = self->source->info.georef.height_unit;
+    for (int64_t at = 0; at < rows * self->width; at++) {
+        place *to = &self->places[worker][at];
+        band.beside[at] = -1;
+        dem_space_at(self->spaces[worker], (double)(at % self->width), (double)(top + at / self->width),
+                     unit * (double)band.heights[at], to->at, to->up);
+    }
+    for (size_t at = self->first[item]; at < self->first[item + 1]; at++)
+        compare_bent(self, self->triangles[at], &band);
+    for (int64_t at = 0; at < rows * self->width; at++)
+        if (band.errors[at] < 0)
+            band.errors[at] = band.beside[at];
+}
+
 /* ---- One band of rows ------------------------------------------------------------------------------ */
 
 static void sum_up(const verifier *self, int64_t top, int64_t rows, const float *heights, const double *errors,
@@ -146,7 +285,9 @@ static tl_status verify_band(void *context, tl_parallel *loop, uint64_t item, un
         return status;
     for (int64_t at = 0; at < rows * self->width; at++)
         errors[at] = -1;
-    for (size_t at = self->first[item]; at < self->first[item + 1]; at++)
+    if (self->bent)
+        compare_bent_band(self, (size_t)item, worker, top, rows);
+    for (size_t at = self->first[item]; !self->bent && at < self->first[item + 1]; at++)
         compare_triangle(self, self->triangles[at], top, top + rows - 1, heights, errors);
     sum_up(self, top, rows, heights, errors, &self->results[item]);
     return TL_OK;
@@ -156,9 +297,12 @@ static tl_status verify_band(void *context, tl_parallel *loop, uint64_t item, un
 
 static void bands_of(const verifier *self, size_t triangle, size_t *first, size_t *last)
 {
-    int32_t a = corner(self, triangle, 0)->j, b = corner(self, triangle, 1)->j, c = corner(self, triangle, 2)->j;
-    *first = (size_t)(tl_int64_min(tl_int64_min(a, b), c) / self->band_rows);
-    *last = (size_t)(tl_int64_max(tl_int64_max(a, b), c) / self->band_rows);
+    const tl_vertex *v[3] = {corner(self, triangle, 0), corner(self, triangle, 1), corner(self, triangle, 2)};
+    int64_t pad = self->bent ? reach(v) : 0;
+    int64_t low = tl_int64_min(tl_int64_min(v[0]->j, v[1]->j), v[2]->j) - pad;
+    int64_t high = tl_int64_max(tl_int64_max(v[0]->j, v[1]->j), v[2]->j) + pad;
+    *first = (size_t)(tl_int64_max(low, 0) / self->band_rows);
+    *last = (size_t)(tl_int64_min(high, self->height - 1) / self->band_rows);
 }
 
 /* Counts first, then fills; a triangle keeps its place in the order of the mesh. */
@@ -225,6 +369,48 @@ static bool make_scratch(verifier *self, unsigned workers)
     return self->heights && self->errors && self->first && self->results;
 }
 
+/* What bent frames need beside. */
+static tl_status make_bent(verifier *self, unsigned workers, tl_error *error)
+{
+    const tl_source_info *info = &self->source->info;
+    self->corners = tl_alloc(self->mesh->vertex_count, sizeof *self->corners);
+    self->places = calloc(workers, sizeof *self->places);
+    self->beside = calloc(workers, sizeof *self->beside);
+    self->spaces = calloc(workers, sizeof(dem_space *));
+    if (!self->corners || !self->places || !self->beside || !self->spaces)
+        return tl_fail_memory(error, "the mesh's verification");
+    for (unsigned i = 0; i < workers; i++) {
+        self->places[i] = tl_alloc_grid(self->width, self->band_rows, sizeof **self->places);
+        self->beside[i] = tl_alloc_grid(self->width, self->band_rows, sizeof **self->beside);
+        if (!self->places[i] || !self->beside[i])
+            return tl_fail_memory(error, "the mesh's verification");
+        self->spaces[i] = dem_space_create(&info->georef, self->width, self->height, info->name, error);
+        if (!self->spaces[i])
+            return TL_ERROR_DATA;
+    }
+    for (size_t k = 0; k < self->mesh->vertex_count; k++) {
+        const tl_vertex *v = &self->mesh->vertices[k];
+        dem_space_at(self->spaces[0], v->i, v->j, info->georef.height_unit * (double)v->z, self->corners[k].at, NULL);
+    }
+    return TL_OK;
+}
+
+static void free_bent(verifier *self, unsigned workers)
+{
+    for (unsigned i = 0; i < workers; i++) {
+        if (self->places)
+            free(self->places[i]);
+        if (self->beside)
+            free(self->beside[i]);
+        if (self->spaces)
+            dem_space_destroy(self->spaces[i]);
+    }
+    free(self->corners);
+    free(self->places);
+    free(self->beside);
+    free(self->spaces);
+}
+
 static void free_scratch(verifier *self, unsigned workers)
 {
     for (unsigned i = 0; i < workers; i++) {
@@ -262,6 +448,12 @@ static tl_mesh_report merge(const verifier *self)
 tl_status tl_mesh_verify(const tl_mesh *mesh, const tl_source *source, const tl_run *run, tl_mesh_report *out,
                          tl_error *error)
 {
+    return tl_mesh_verify_in(mesh, source, TL_FRAME_PIXEL, run, out, error);
+}
+
+tl_status tl_mesh_verify_in(const tl_mesh *mesh, const tl_source *source, tl_frame frame, const tl_run *run,
+                            tl_mesh_report *out, tl_error *error)
+{
     verifier self = {.mesh = mesh, .source = source, .width = source->info.width, .height = source->info.height};
     tl_status status = check_mesh(&self, error);
     if (status != TL_OK)
@@ -269,13 +461,17 @@ tl_status tl_mesh_verify(const tl_mesh *mesh, const tl_source *source, const tl_
     self.band_rows = tl_int64_min(self.height, tl_int64_max(8, BAND_SAMPLES / self.width));
     self.bands = (size_t)tl_div_up(self.height, self.band_rows);
     unsigned workers = tl_parallel_workers(run, self.bands);
+    self.bent = dem_frame_bends(&source->info.georef, frame);
     status =
         make_scratch(&self, workers) ? sort_triangles(&self, error) : tl_fail_memory(error, "the mesh's verification");
+    if (status == TL_OK && self.bent)
+        status = make_bent(&self, workers, error);
     if (status == TL_OK)
         status =
             tl_parallel_for(run, self.bands, (uint64_t)self.width * (uint64_t)self.height, verify_band, &self, error);
     if (status == TL_OK)
         *out = merge(&self);
     free_scratch(&self, workers);
+    free_bent(&self, workers);
     return status;
 }
