@@ -1,5 +1,6 @@
 #include "lib/out/frame.h"
 
+#include "dem/control_grid.h"
 #include "dem/crs.h"
 #include "lib/base/error.h"
 
@@ -17,8 +18,11 @@ struct out_frame {
     const tl_georef *georef;
     dem_projection *projection; /* of ENU frames */
     dem_local_frame *local;
+    dem_control_grid *grid; /* of positions on the ellipsoid and of the way up; NULL: each vertex by itself */
     double origin[3];
 };
+
+enum { BATCH = 1024, MANY = 1 << 20 };
 
 static void position(const tl_georef *g, double i, double j, double *x, double *y)
 {
@@ -27,11 +31,13 @@ static void position(const tl_georef *g, double i, double j, double *x, double *
     *y = t[3] + t[4] * i + t[5] * j;
 }
 
-/* The middle of the vertices' box at their middle height, so that float coordinates are small everywhere. */
-static void set_origin(out_frame *frame, const tl_mesh *mesh)
+/* The vertices' box: columns, rows, heights. */
+static void find_box(const tl_mesh *mesh, double low[3], double high[3])
 {
-    const double far = (double)INFINITY; /* a float constant */
-    double low[3] = {far, far, far}, high[3] = {-far, -far, -far};
+    for (int a = 0; a < 3; a++) {
+        low[a] = (double)INFINITY; /* a float constant */
+        high[a] = -(double)INFINITY;
+    }
     for (size_t k = 0; k < mesh->vertex_count; k++) {
         const double at[3] = {mesh->vertices[k].i, mesh->vertices[k].j, (double)mesh->vertices[k].z};
         for (int a = 0; a < 3; a++) {
@@ -41,9 +47,54 @@ static void set_origin(out_frame *frame, const tl_mesh *mesh)
     }
     if (!mesh->vertex_count)
         low[0] = low[1] = low[2] = high[0] = high[1] = high[2] = 0;
+}
+
+/* The middle of the box, so that float coordinates are small everywhere. */
+static void set_origin(out_frame *frame, const double low[3], const double high[3])
+{
     position(frame->georef, 0.5 * (low[0] + high[0]), 0.5 * (low[1] + high[1]), &frame->origin[0], &frame->origin[1]);
     frame->origin[2] = 0.5 * (low[2] + high[2]) * frame->georef->height_unit;
     dem_projection_to_lonlat(frame->projection, 1, &frame->origin[0], &frame->origin[1]);
+}
+
+/* Where samples lie on the ellipsoid, and by how much a metre of height moves them. */
+static void evaluate(void *context, size_t n, const double *i, const double *j, double *out)
+{
+    const out_frame *frame = context;
+    for (size_t done = 0; done < n; done += BATCH) {
+        double x[BATCH], y[BATCH];
+        size_t count = n - done < BATCH ? n - done : BATCH;
+        for (size_t k = 0; k < count; k++)
+            position(frame->georef, i[done + k], j[done + k], &x[k], &y[k]);
+        dem_projection_to_lonlat(frame->projection, count, x, y);
+        for (size_t k = 0; k < count; k++, out += 6) {
+            double above[3];
+            const double up = 1e4; /* metres; the way up is a straight line */
+            dem_local_frame_forward(frame->local, x[k], y[k], 0, out);
+            dem_local_frame_forward(frame->local, x[k], y[k], up, above);
+            for (int a = 0; a < 3; a++)
+                out[3 + a] = (above[a] - out[a]) / up;
+        }
+    }
+}
+
+/* A million vertices are worth a control grid: they land within a millimetre, or within a thousandth of a cell where
+ * that is less, of where they would. */
+static tl_status begin_grid(out_frame *frame, const double low[3], const double high[3], size_t vertices,
+                            tl_error *error)
+{
+    const tl_georef *g = frame->georef;
+    double height = fmax(fabs(low[2]), fabs(high[2])) * g->height_unit;
+    dem_control_function f = {.components = 6,
+                              .evaluate = evaluate,
+                              .context = frame,
+                              .weights = {1, 1, 1, height, height, height},
+                              .tolerance = 1e-3 * fmin(1, fmin(g->cell_x, g->cell_y))};
+    if (vertices < MANY || !isfinite(height) || !(f.tolerance > 0))
+        return TL_OK;
+    tl_window window = {(int64_t)low[0], (int64_t)low[1], (int64_t)(high[0] - low[0]) + 1,
+                        (int64_t)(high[1] - low[1]) + 1};
+    return dem_control_grid_create(&f, window, vertices / 4, &frame->grid, error);
 }
 
 static tl_status begin_enu(out_frame *frame, const tl_mesh *mesh, const char *path, tl_error *error)
@@ -56,13 +107,15 @@ static tl_status begin_enu(out_frame *frame, const tl_mesh *mesh, const char *pa
     frame->projection = dem_projection_create(g->crs, error);
     if (!frame->projection)
         return TL_ERROR_DATA;
-    set_origin(frame, mesh);
+    double low[3], high[3];
+    find_box(mesh, low, high);
+    set_origin(frame, low, high);
     if (!isfinite(frame->origin[0]) || !isfinite(frame->origin[1]))
         return tl_fail(error, TL_ERROR_DATA,
                        "%s: the raster's middle has no longitude and latitude in %s; use --frame projected", path,
                        tl_crs_name(g->crs));
     frame->local = dem_local_frame_create(g->crs, frame->origin[0], frame->origin[1], frame->origin[2], error);
-    return frame->local ? TL_OK : TL_ERROR_DATA;
+    return frame->local ? begin_grid(frame, low, high, mesh->vertex_count, error) : TL_ERROR_DATA;
 }
 
 out_frame *out_frame_create(const tl_mesh *mesh, tl_frame kind, const char *path, tl_error *error)
@@ -88,6 +141,7 @@ void out_frame_destroy(out_frame *frame)
 {
     if (!frame)
         return;
+    dem_control_grid_destroy(frame->grid);
     dem_projection_destroy(frame->projection);
     dem_local_frame_destroy(frame->local);
     free(frame);
@@ -111,11 +165,28 @@ bool out_frame_faces_up(const out_frame *frame)
     return t[1] * t[5] - t[2] * t[4] < 0;
 }
 
-enum { BATCH = 1024 };
+static void apply_grid(const out_frame *frame, const tl_vertex *v, size_t n, double (*xyz)[3])
+{
+    double i[BATCH], j[BATCH], place[6 * BATCH];
+    for (size_t k = 0; k < n; k++) {
+        i[k] = v[k].i;
+        j[k] = v[k].j;
+    }
+    dem_control_grid_apply(frame->grid, n, i, j, place);
+    for (size_t k = 0; k < n; k++) {
+        double height = (double)v[k].z * frame->georef->height_unit;
+        for (size_t a = 0; a < 3; a++)
+            xyz[k][a] = place[6 * k + a] + height * place[6 * k + 3 + a];
+    }
+}
 
 static tl_status apply_enu(out_frame *frame, const tl_vertex *v, size_t n, double (*xyz)[3], tl_error *error)
 {
     double x[BATCH], y[BATCH];
+    if (frame->grid) {
+        apply_grid(frame, v, n, xyz);
+        return TL_OK;
+    }
     for (size_t k = 0; k < n; k++)
         position(frame->georef, v[k].i, v[k].j, &x[k], &y[k]);
     dem_projection_to_lonlat(frame->projection, n, x, y);
