@@ -332,6 +332,14 @@ typedef struct tl_mesh {
 
 TL_API void tl_mesh_destroy(tl_mesh *mesh);
 
+/* Coordinates of mesh vertices. */
+typedef enum tl_frame {
+    TL_FRAME_DEFAULT = 0, /* ENU where the CRS is known, else projected */
+    TL_FRAME_ENU,         /* metres east, north and up of the tangent plane at the grid's middle (glTF: its Y up) */
+    TL_FRAME_PROJECTED,   /* CRS coordinates and heights as they are */
+    TL_FRAME_PIXEL,       /* column, row (downwards), height: sample positions, not cell corners */
+} tl_frame;
+
 /* The full grid as a mesh: two triangles a cell, none where a corner is void (one where only one is). Grids
  * of more than 2^31 samples are refused. */
 TL_API tl_status tl_mesh_from_source(const tl_source *source, const tl_run *run, tl_mesh **out, tl_error *error);
@@ -349,6 +357,11 @@ typedef struct tl_mesh_report {
  * precision, triangle by triangle. */
 TL_API tl_status tl_mesh_verify(const tl_mesh *mesh, const tl_source *source, const tl_run *run, tl_mesh_report *out,
                                 tl_error *error);
+/* The same in the frame that the mesh is written in: in an ENU frame, the distance of every sample from the flat
+ * triangles along the ellipsoid's vertical through it. Samples of the raster's rim that the chords there leave out are
+ * measured from the plane of the triangle that covers them on the lattice. */
+TL_API tl_status tl_mesh_verify_in(const tl_mesh *mesh, const tl_source *source, tl_frame frame, const tl_run *run,
+                                   tl_mesh_report *out, tl_error *error);
 
 /* ---- Framework --------------------------------------------------------------------------------- */
 
@@ -360,6 +373,10 @@ typedef struct tl_framework tl_framework;
 typedef struct tl_framework_options {
     double max_error; /* largest vertical distance allowed at any sample, in units of height; >= 0 */
     const tl_run *run;
+    /* The frame that the mesh will be written in, where the bound holds (before coordinates are rounded to the file's
+     * numbers). In ENU frames samples lie on the curved ellipsoid and triangles are flat, so that a wide one sags
+     * below level ground: by 2 m if it is 10 km wide. The other frames have flat lattices. */
+    tl_frame frame;
 } tl_framework_options;
 
 TL_API tl_framework *tl_framework_build(const tl_source *dem, const tl_framework_options *options, tl_error *error);
@@ -436,14 +453,6 @@ typedef struct tl_format {
 TL_API const tl_format *tl_formats(void);
 /* The format of a path by its ending, upper or lower case; NULL where there is none. */
 TL_API const tl_format *tl_format_of(const char *path);
-
-/* Coordinates of mesh vertices. */
-typedef enum tl_frame {
-    TL_FRAME_DEFAULT = 0, /* ENU where the CRS is known, else projected */
-    TL_FRAME_ENU,         /* metres east, north and up of the tangent plane at the grid's middle (glTF: its Y up) */
-    TL_FRAME_PROJECTED,   /* CRS coordinates and heights as they are */
-    TL_FRAME_PIXEL,       /* column, row (downwards), height: sample positions, not cell corners */
-} tl_frame;
 
 typedef enum tl_compression {
     TL_COMPRESSION_DEFAULT = 0, /* EXR: zip; GeoTIFF: deflate */
