@@ -8,7 +8,7 @@
 
 /* Weights of the mean-exact prediction; d1 + 2 d2 + 3 d3 = 1/8 makes it exact for planes. */
 enum { REACH = 3 };
-static const double slope_weights[REACH + 1] = {0, .22405, -.06762, .01206};
+static const float slope_weights[REACH + 1] = {0, .22405f, -.06762f, .01206f};
 
 /* Share of white noise's variance that the three details keep together. A detail of the children keeps 1/4. A mean of
  * four has 1/4 of the noise, and its slope, q = 2 (d1^2 + d2^2 + d3^2) of that; the prediction touches no child of the
@@ -31,57 +31,78 @@ static void block_means(const float *in, size_t width, size_t height, size_t ste
     }
 }
 
-/* D along a stride: the predicted half difference of the children. */
-static double slope(const float *mean, ptrdiff_t stride)
+/* D at one place of a field, `stride` between neighbours: the predicted half difference of the children. */
+static inline float slope_at(const float *field, ptrdiff_t stride)
 {
-    double sum = 0;
-    for (int k = 1; k <= REACH; k++)
-        sum += slope_weights[k] * ((double)mean[k * stride] - (double)mean[-k * stride]);
-    return sum;
+    return slope_weights[1] * (field[stride] - field[-stride]) +
+           slope_weights[2] * (field[2 * stride] - field[-2 * stride]) +
+           slope_weights[3] * (field[3 * stride] - field[-3 * stride]);
 }
 
-/* D along rows of D along columns. */
-static double cross_slope(const float *mean, ptrdiff_t dx, ptrdiff_t dy)
+/* D along rows of the means, for the columns x0 ... x1 - 1 of all rows. */
+static void row_slopes(const float *means, size_t width, size_t height, size_t step, size_t x0, size_t x1, float *out)
 {
-    double sum = 0;
-    for (int k = 1; k <= REACH; k++)
-        sum += slope_weights[k] * (slope(mean + k * dy, dx) - slope(mean - k * dy, dx));
-    return sum;
+    for (size_t y = 0; y + step < height; y++) /* the last rows have no means */
+        for (size_t x = x0; x < x1; x++)
+            out[y * width + x] = slope_at(means + y * width + x, 2 * (ptrdiff_t)step);
 }
 
-static void add_block(const float *child, const float *mean, size_t width, size_t step, fbm_detail *detail)
+/* Columns that are summed up as floats' squares before they are added in double, in four interleaved sums: the order is
+ * fixed. */
+enum { LANES = 4 };
+
+typedef struct sums {
+    double x[LANES], y[LANES], mixed[LANES], count[LANES];
+} sums;
+
+/* Adds the details of the blocks at columns x0 ... x1 - 1 of row y. */
+static void add_row(const float *children, const float *means, const float *slopes, size_t width, size_t step,
+                    size_t x0, size_t x1, sums *total)
 {
-    ptrdiff_t dx = (ptrdiff_t)step, dy = (ptrdiff_t)(step * width);
-    double a = (double)child[0], b = (double)child[dx], c = (double)child[dy], d = (double)child[dx + dy];
-    double x = 0.25 * ((b - a) + (d - c)) - slope(mean, 2 * dx);
-    double y = 0.25 * ((c - a) + (d - b)) - slope(mean, 2 * dy);
-    double mixed = 0.25 * ((a - b) + (d - c)) - cross_slope(mean, 2 * dx, 2 * dy);
-    double sum = x * x + y * y + mixed * mixed;
-    if (!isfinite(sum)) /* a void in the support */
-        return;
-    detail->x += x * x;
-    detail->y += y * y;
-    detail->mixed += mixed * mixed;
-    detail->count++;
+    const float *below = children + step * width;
+    ptrdiff_t down = (ptrdiff_t)(2 * step * width);
+    for (size_t k = x0; k < x1; k++) {
+        float a = children[k], b = children[k + step], c = below[k], d = below[k + step];
+        float x = 0.25f * ((b - a) + (d - c)) - slopes[k];
+        float y = 0.25f * ((c - a) + (d - b)) - slope_at(means + k, down);
+        float mixed = 0.25f * ((a - b) + (d - c)) - slope_at(slopes + k, down);
+        float all = x * x + y * y + mixed * mixed;
+        bool known = all - all == 0; /* neither NaN, as with a void in the support, nor infinite */
+        size_t lane = k % LANES;
+        total->x[lane] += known ? (double)(x * x) : 0;
+        total->y[lane] += known ? (double)(y * y) : 0;
+        total->mixed[lane] += known ? (double)(mixed * mixed) : 0;
+        total->count[lane] += known;
+    }
 }
 
 static void add_octave(const float *children, const float *means, size_t width, size_t height, size_t step,
-                       const size_t box[4], fbm_detail *detail)
+                       const size_t box[4], float *slopes, fbm_detail *detail)
 {
     size_t before = 2 * REACH * step, after = (2 * REACH + 1) * step;
-    for (size_t y = box[1]; y < box[3]; y++)
-        for (size_t x = box[0]; x < box[2]; x++)
-            if (x >= before && y >= before && x + after < width && y + after < height)
-                add_block(children + y * width + x, means + y * width + x, width, step, detail);
+    if (width <= before + after || height <= before + after)
+        return;
+    size_t x0 = box[0] > before ? box[0] : before, x1 = box[2] < width - after ? box[2] : width - after;
+    size_t y0 = box[1] > before ? box[1] : before, y1 = box[3] < height - after ? box[3] : height - after;
+    sums total = {{0}, {0}, {0}, {0}};
+    row_slopes(means, width, height, step, x0, x1, slopes);
+    for (size_t y = y0; y < y1; y++)
+        add_row(children + y * width, means + y * width, slopes + y * width, width, step, x0, x1, &total);
+    for (int lane = 0; lane < LANES; lane++) {
+        detail->x += total.x[lane];
+        detail->y += total.y[lane];
+        detail->mixed += total.mixed[lane];
+        detail->count += (uint64_t)total.count[lane];
+    }
 }
 
 void fbm_detail_add(const float *heights, size_t width, size_t height, size_t x0, size_t y0, size_t x1, size_t y1,
                     float *scratch, fbm_detail octaves[2])
 {
     const size_t box[4] = {x0, y0, x1, y1};
-    float *means = scratch, *means_of_means = scratch + width * height;
+    float *means = scratch, *means_of_means = scratch + width * height, *slopes = scratch + 2 * width * height;
     block_means(heights, width, height, 1, means);
-    add_octave(heights, means, width, height, 1, box, &octaves[0]);
+    add_octave(heights, means, width, height, 1, box, slopes, &octaves[0]);
     if (width < 2 || height < 2)
         return;
     /* what block_means leaves unset at the rim must not look like heights */
@@ -90,7 +111,7 @@ void fbm_detail_add(const float *heights, size_t width, size_t height, size_t x0
     for (size_t x = 0; x < width; x++)
         means[(height - 1) * width + x] = NAN;
     block_means(means, width, height, 2, means_of_means);
-    add_octave(means, means_of_means, width, height, 2, box, &octaves[1]);
+    add_octave(means, means_of_means, width, height, 2, box, slopes, &octaves[1]);
 }
 
 double fbm_detail_variance(const fbm_detail *detail, int octave, double noise)
@@ -123,8 +144,8 @@ static stencils make_stencils(void)
     s.haar[own + 1] = 0.5;
     for (int k = 1; k <= REACH; k++)
         for (int child = 0; child < 2; child++) {
-            s.slope[own + 2 * k + child] += 0.5 * slope_weights[k];
-            s.slope[own - 2 * k + child] -= 0.5 * slope_weights[k];
+            s.slope[own + 2 * k + child] += 0.5 * (double)slope_weights[k];
+            s.slope[own - 2 * k + child] -= 0.5 * (double)slope_weights[k];
         }
     return s;
 }

@@ -386,7 +386,7 @@ static void whiteNoiseHasTheDetailOfTheory(void **state)
 {
     (void)state;
     enum { SIDE = 300 };
-    float *heights = malloc(SIDE * SIDE * sizeof *heights), *scratch = malloc(2 * SIDE * SIDE * sizeof *scratch);
+    float *heights = malloc(SIDE * SIDE * sizeof *heights), *scratch = malloc(3 * SIDE * SIDE * sizeof *scratch);
     uint64_t random = 77;
     for (int k = 0; k < SIDE * SIDE; k++)
         heights[k] = (float)(draw(&random) - 0.5);

@@ -48,7 +48,7 @@ static tl_status measure_block(void *context, tl_parallel *loop, uint64_t item, 
     int64_t y0 = tl_int64_max(0, y - FBM_DETAIL_BEFORE), y1 = tl_int64_min(info->height, y + BLOCK + FBM_DETAIL_AFTER);
     tl_window window = {x0, y0, x1 - x0, y1 - y0};
     size_t samples = (size_t)(window.width * window.height);
-    float *heights = tl_alloc(samples, 3 * sizeof *heights);
+    float *heights = tl_alloc(samples, 4 * sizeof *heights);
     if (!heights)
         return tl_fail_memory(error, info->name);
     tl_status status = tl_source_read(m->dem, info->level, window, heights, error);
