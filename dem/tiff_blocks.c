@@ -125,7 +125,8 @@ static tl_status look_up_block(const dem_blocks *blocks, const chunk *self, dem_
     if (failed)
         return fail_block(blocks, self, handle, error);
     *sparse = bytes == 0;
-    if (*sparse || is_plausible(&blocks->layout, self, bytes))
+    uint64_t size = (uint64_t)dem_tiff_file_size(blocks->file); /* whatever the table says */
+    if (*sparse || is_plausible(&blocks->layout, self, bytes < size ? bytes : size))
         return TL_OK;
     return fail_block(blocks, self, handle, error);
 }
