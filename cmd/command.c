@@ -66,9 +66,13 @@ tl_run command_run(const common *options, progress *bar)
 
 static tl_source *open_files(const common *options, const arguments *inputs, const tl_run *quietly, tl_error *error)
 {
-    const tl_dem_options dem = {.band = (unsigned)options->band, .feather = options->feather, .run = quietly};
+    const tl_dem_options dem = {.band = (unsigned)options->band,
+                                .feather = options->feather,
+                                .memory = (size_t)(options->memory ? options->memory : DEFAULT_MEMORY)
+                                          << 18, /* a quarter */
+                                .run = quietly};
     if (inputs->count == 1 && !options->feather && !options->band)
-        return tl_open(inputs->names[0], error);
+        return tl_open_with(inputs->names[0], &dem, error);
     return tl_dem_open((const char *const *)inputs->names, inputs->count, &dem, error);
 }
 

@@ -17,6 +17,8 @@ typedef struct command {
 
 extern const command command_info, command_simplify, command_synth, command_preview, command_noise;
 
+enum { DEFAULT_MEMORY = 512 };
+
 /* Options that most commands have. */
 typedef struct common {
     const char *output;
@@ -26,7 +28,8 @@ typedef struct common {
     bool nodata_given;
     int64_t band; /* 0: the first */
     int64_t threads;
-    int progress; /* index into the names of progress_style */
+    int64_t memory; /* MB; 0: DEFAULT_MEMORY */
+    int progress;   /* index into the names of progress_style */
 } common;
 
 /* The rows of the options in a `common`, for use inside of an array of options. */
@@ -67,6 +70,16 @@ typedef struct common {
 #define COMMON_RUNNING(c)                                                                                              \
     {"threads", 't', OPTION_INTEGER, &(c).threads, NULL, "N", "worker threads, 1...512 (default: one a processor)", 1, \
      512,       NULL},                                                                                                 \
+        {"memory",                                                                                                     \
+         0,                                                                                                            \
+         OPTION_INTEGER,                                                                                               \
+         &(c).memory,                                                                                                  \
+         NULL,                                                                                                         \
+         "MB",                                                                                                         \
+         "to stay in, 16...1048576; a quarter keeps blocks of the input (default: 512)",                               \
+         16,                                                                                                           \
+         1048576,                                                                                                      \
+         NULL},                                                                                                        \
         {"progress",                                                                                                   \
          0,                                                                                                            \
          OPTION_CHOICE,                                                                                                \

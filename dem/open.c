@@ -109,7 +109,7 @@ static tl_source *open_several(const dem_paths *paths, const char *name, const t
     opening o = {.paths = paths, .options = options};
     o.members = calloc(paths->count, sizeof(tl_source *));
     o.sharing.pool = dem_file_pool_create(open_limit(options));
-    o.sharing.cache = dem_block_cache_create(DEM_CACHE_BYTES, 16 * (uint64_t)paths->count);
+    o.sharing.cache = dem_block_cache_create(dem_cache_budget(options), 16 * (uint64_t)paths->count);
     tl_source *joined = NULL;
     if (!o.members || !o.sharing.pool || !o.sharing.cache)
         tl_fail_memory(error, name);

@@ -134,11 +134,12 @@ static tl_status read_georef(dem_source *dem, TIFF *tiff, const tl_crs *known, t
     return dem_georef_measure(georef, info->width, info->height, error);
 }
 
-static tl_status prepare_blocks(dem_source *dem, dem_block_cache *shared, tl_error *error)
+static tl_status prepare_blocks(dem_source *dem, dem_block_cache *shared, const tl_dem_options *options,
+                                tl_error *error)
 {
     const dem_layout *layout = &dem->layout;
     if (!shared)
-        dem->own_cache = dem_block_cache_create(DEM_CACHE_BYTES, (uint64_t)(layout->across * layout->down));
+        dem->own_cache = dem_block_cache_create(dem_cache_budget(options), (uint64_t)(layout->across * layout->down));
     dem->cache = shared ? shared : dem->own_cache;
     if (!dem->cache)
         return tl_fail_memory(error, dem->source.info.name);
@@ -146,11 +147,11 @@ static tl_status prepare_blocks(dem_source *dem, dem_block_cache *shared, tl_err
     return dem->blocks ? TL_OK : TL_ERROR_MEMORY;
 }
 
-static tl_status read_directory(dem_source *dem, dem_tiff_handle *handle, const dem_sharing *sharing, unsigned band,
-                                tl_error *error)
+static tl_status read_directory(dem_source *dem, dem_tiff_handle *handle, const dem_sharing *sharing,
+                                const tl_dem_options *options, tl_error *error)
 {
     tl_source_info *info = &dem->source.info;
-    tl_status status = dem_layout_read(handle, band, &dem->layout, error);
+    tl_status status = dem_layout_read(handle, options->band, &dem->layout, error);
     if (status != TL_OK)
         return status;
     info->width = dem->layout.width;
@@ -158,7 +159,7 @@ static tl_status read_directory(dem_source *dem, dem_tiff_handle *handle, const 
     info->has_voids = dem->layout.has_voids;
     info->quantum = dem->layout.quantum;
     status = read_georef(dem, handle->tiff, sharing->crs, error);
-    return status == TL_OK ? prepare_blocks(dem, sharing->cache, error) : status;
+    return status == TL_OK ? prepare_blocks(dem, sharing->cache, options, error) : status;
 }
 
 static tl_status keep_overviews(dem_source *dem, const dem_overview *found, unsigned usable, tl_error *error)
@@ -199,7 +200,7 @@ static tl_status open_source(dem_source *dem, const dem_sharing *sharing, const 
     tl_status status = dem_tiff_take(dem->tiff, 0, &handle, error);
     if (status != TL_OK)
         return status;
-    status = read_directory(dem, handle, sharing, options->band, error);
+    status = read_directory(dem, handle, sharing, options, error);
     if (TIFFLastDirectory(handle->tiff)) {
         dem_tiff_give_back(dem->tiff, handle);
         return status;

@@ -15,6 +15,12 @@ typedef struct dem_sharing {
 
 enum { DEM_CACHE_BYTES = 64 << 20 };
 
+/* Bytes of decoded blocks to keep. */
+static inline size_t dem_cache_budget(const tl_dem_options *options)
+{
+    return options->memory ? options->memory : DEM_CACHE_BYTES;
+}
+
 /* Opens a GeoTIFF or an SRTM .hgt file. */
 tl_source *dem_file_source(const char *path, const dem_sharing *sharing, const tl_dem_options *options,
                            tl_error *error);

@@ -193,6 +193,7 @@ typedef struct tl_dem_options {
      * where they are smaller by exactly a power of two; how they were made is not known, so they may not be means. */
     bool exact_levels;
     unsigned open_files; /* of a mosaic, at a time, beside those that are being read; 0: 64 */
+    size_t memory;       /* bytes of decoded blocks kept for the next windows, beside those in use; 0: 64 MB */
     const tl_run *run;   /* for opening several files */
 } tl_dem_options;
 
@@ -210,6 +211,9 @@ typedef struct tl_dem_options {
  * other. `quantum` is the smallest of the files' where all are multiples of it, else, and where heights are
  * interpolated or feathered, 0. */
 TL_API tl_source *tl_dem_open(const char *const *paths, size_t count, const tl_dem_options *options, tl_error *error);
+
+/* As tl_open, with options for elevation models; they mean nothing for an EXR. */
+TL_API tl_source *tl_open_with(const char *path, const tl_dem_options *options, tl_error *error);
 
 /* Sources that tl_dem_open made hold coarser levels, down to a single sample. Level -k of a point raster has the
  * samples whose column and row are multiples of 2^k, that of an area raster the means of the valid samples of 2^k x 2^k

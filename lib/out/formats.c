@@ -178,7 +178,12 @@ static bool is_exr(const char *path)
     return count == (ssize_t)sizeof head && memcmp(head, magic, sizeof head) == 0;
 }
 
+tl_source *tl_open_with(const char *path, const tl_dem_options *options, tl_error *error)
+{
+    return is_exr(path) ? out_exr_open(path, error) : tl_dem_open(&path, 1, options, error);
+}
+
 tl_source *tl_open(const char *path, tl_error *error)
 {
-    return is_exr(path) ? out_exr_open(path, error) : tl_dem_open(&path, 1, NULL, error);
+    return tl_open_with(path, NULL, error);
 }
