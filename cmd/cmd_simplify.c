@@ -17,7 +17,7 @@ static int report_check(const settings *set, const tl_mesh_report *check)
                     (unsigned long long)check->uncovered);
     else
         command_say(&set->common,
-                    "verified: largest error %.9g at column %lld, row %lld; rms %.4g; %llu samples, %llu uncovered",
+                    "verified: largest error %.7g at column %lld, row %lld; rms %.4g; %llu samples, %llu uncovered",
                     check->max_error, (long long)check->worst_i, (long long)check->worst_j, check->rms_error,
                     (unsigned long long)check->samples, (unsigned long long)check->uncovered);
     if (check->max_error <= set->max_error)
