@@ -22,13 +22,30 @@ struct dem_local_frame {
 
 /* ---- Comparison ---- */
 
-static bool equivalent_wkt(const char *a, const char *b)
+static void no_message(void *user, int level, const char *text)
+{
+    (void)user;
+    (void)level;
+    (void)text;
+}
+
+PJ_CONTEXT *dem_proj_context(void)
 {
     PJ_CONTEXT *context = proj_context_create();
+    if (context) {
+        /* a level of none does not silence a missing database */
+        proj_log_func(context, NULL, no_message);
+        proj_log_level(context, PJ_LOG_NONE);
+        proj_context_set_enable_network(context, 0);
+    }
+    return context;
+}
+
+static bool equivalent_wkt(const char *a, const char *b)
+{
+    PJ_CONTEXT *context = dem_proj_context();
     if (!context)
         return false;
-    proj_log_level(context, PJ_LOG_NONE);
-    proj_context_set_enable_network(context, 0);
     PJ *first = proj_create(context, a), *second = proj_create(context, b);
     /* the order of axes is no matter: ours is always x, y */
     bool same = first && second &&
@@ -83,11 +100,9 @@ static tl_status prepare(dem_projection *projection, const tl_crs *crs, tl_error
 {
     if (crs->geographic)
         return TL_OK;
-    projection->context = proj_context_create();
+    projection->context = dem_proj_context();
     if (!projection->context)
         return tl_fail_memory(error, crs->name);
-    proj_log_level(projection->context, PJ_LOG_NONE);
-    proj_context_set_enable_network(projection->context, 0);
     find_map(projection, crs);
     if (!projection->map && !projection->to_lonlat)
         return tl_fail(error, TL_ERROR_DATA, "PROJ cannot convert coordinates of %s to longitude and latitude",

@@ -7,6 +7,9 @@
 
 #include <proj.h>
 
+/* A context of PROJ's that prints nothing and asks no network; NULL when out of memory. */
+PJ_CONTEXT *dem_proj_context(void);
+
 /* The map of a projected CRS, whose PROJ object is `object`; false where GeographicLib has no such projection, or where
  * its coordinates do not run to the east and to the north. */
 bool dem_crs_map(PJ_CONTEXT *context, const PJ *object, const tl_crs *crs, dem_map_definition *out);

@@ -1,6 +1,7 @@
 /* CRSs from GeoTIFF keys and from text. libgeotiff makes sense of the keys, PROJ of everything else. */
 #include "dem/crs.h"
 
+#include "dem/crs_map.h"
 #include "dem/geokeys.h"
 #include "dem/text.h"
 #include "lib/base/error.h"
@@ -19,16 +20,6 @@
 #include <strings.h>
 
 static const double degrees_per_radian = 57.295779513082320877;
-
-static PJ_CONTEXT *quiet_context(void)
-{
-    PJ_CONTEXT *context = proj_context_create();
-    if (context) {
-        proj_log_level(context, PJ_LOG_NONE);
-        proj_context_set_enable_network(context, 0);
-    }
-    return context;
-}
 
 /* ---- From PROJ's object to ours ---- */
 
@@ -239,7 +230,7 @@ static tl_status finish(PJ_CONTEXT *context, PJ *whole, const char *path, tl_crs
 tl_status dem_crs_from_text(const char *text, const char *path, tl_crs **out, tl_error *error)
 {
     double to_degrees;
-    PJ_CONTEXT *context = quiet_context();
+    PJ_CONTEXT *context = dem_proj_context();
     if (!context)
         return tl_fail_memory(error, path);
     PJ *crs = proj_create(context, text);
@@ -609,7 +600,7 @@ static void keep_keys(tl_crs *crs, dem_geokeys *keys, bool in_degrees)
 
 static tl_status from_keys(dem_geokeys *keys, const char *path, tl_crs **out, double *scale, tl_error *error)
 {
-    PJ_CONTEXT *context = quiet_context();
+    PJ_CONTEXT *context = dem_proj_context();
     if (!context)
         return tl_fail_memory(error, path);
     dem_locale locale = dem_locale_enter();

@@ -62,8 +62,9 @@ TL_API const char *tl_status_name(tl_status status);
 /* How long-running calls run. NULL where a tl_run is asked for means all defaults. */
 typedef struct tl_run {
     unsigned threads; /* worker threads; 0: one a processor that this process may use */
-    const volatile int
-        *cancel; /* polled; when it becomes non-zero the call ends with TL_ERROR_CANCELLED; NULL: never */
+    /* Polled, by any thread, atomically; when it becomes non-zero the call ends with TL_ERROR_CANCELLED. NULL: never.
+     */
+    const volatile int *cancel;
     /* Called on the calling thread only, at most about ten times a second and once at the end, with the
      * work done and the whole work in samples. NULL: not wanted. */
     void (*progress)(void *user, uint64_t done, uint64_t total);
@@ -296,7 +297,7 @@ TL_API tl_status tl_source_suspects(const tl_source *source, const tl_run *run, 
 
 typedef enum tl_void_rule {
     TL_VOIDS_KEEP = 0, /* voids stay voids */
-    TL_VOIDS_FILL,     /* a membrane from the rim of each hole: Laplace's equation, to 1e-5 of the heights' range */
+    TL_VOIDS_FILL,     /* a membrane from the rim of each hole: Laplace's equation, to 2e-5 of the heights' range */
     TL_VOIDS_VALUE,    /* one height for all */
 } tl_void_rule;
 
@@ -309,8 +310,9 @@ typedef struct tl_void_options {
 } tl_void_options;
 
 /* A source whose voids are treated by a rule; its tl_source_validity tells which samples were filled. Filling keeps
- * the filled samples in memory, in blocks of 64 x 64, and needs about 16 bytes a sample of the box around a hole while
- * it solves it. Voids of a raster without any valid sample stay voids. Only the source's finest level is held. */
+ * the filled samples in memory, in blocks of 64 x 64. While it works it needs some 20 bytes a sample of the box around
+ * a group of blocks that hold voids and touch: for scattered voids that is the whole raster. Voids of a raster without
+ * any valid sample stay voids. Only the source's finest level is held. */
 TL_API tl_source *tl_voids_create(const tl_source *source, const tl_void_options *options, tl_error *error);
 
 /* ---- Meshes ------------------------------------------------------------------------------------ */
@@ -410,7 +412,7 @@ typedef struct tl_field_options {
     int levels;         /* halvings of the DEM's spacing, 0 ... 30 */
     const char *scheme; /* a name of tl_schemes(); NULL: the default */
     bool hurst_given, delta_given;
-    double hurst; /* Hurst exponent in (0, 1) of every level below the DEM; where not given, measured from the DEM */
+    double hurst; /* Hurst exponent of every level below the DEM, 0.01 ... 0.99; where not given, measured */
     double delta; /* standard deviation of the height difference of neighbouring DEM samples in the fractal model,
                      in units of height, >= 0; where not given, measured from the DEM */
     uint64_t seed;
