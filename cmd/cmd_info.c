@@ -6,6 +6,8 @@
 #include <stdlib.h>
 #include <string.h>
 
+enum { MEMORY = 64 }; /* megabytes */
+
 typedef struct settings {
     common common;
     bool json;
@@ -419,10 +421,12 @@ static int run(const command *self, int argc, const char **argv, bool help)
     int status;
     if (!command_begin(self, argc, argv, help, groups, -1, &rest, &status))
         return status;
+    if (!set.common.memory)
+        set.common.memory = MEMORY; /* each block is looked at once or twice, one after the other */
     status = inform(&set, &rest);
     arguments_free(&rest);
     return status;
 }
 
-const command command_info = {"info", "tell what a raster holds", "RASTER... [--json] [--window X,Y,W,H]", INPUT_NOTES,
-                              run};
+const command command_info = {"info", "tell what a raster holds", "RASTER... [--json] [--window X,Y,W,H]",
+                              INPUT_NOTES "\n\nWithout --memory, info takes 64 MB.", run};

@@ -158,6 +158,8 @@ static tl_status read_directory(dem_source *dem, dem_tiff_handle *handle, const 
     info->height = dem->layout.height;
     info->has_voids = dem->layout.has_voids;
     info->quantum = dem->layout.quantum;
+    info->block_width = dem->layout.block_width;
+    info->block_height = dem->layout.block_height;
     status = read_georef(dem, handle->tiff, sharing->crs, error);
     return status == TL_OK ? prepare_blocks(dem, sharing->cache, options, error) : status;
 }

@@ -128,6 +128,8 @@ typedef struct tl_source_info {
     bool has_voids;   /* false: certainly no NaN; true: NaN may occur */
     bool wraps;       /* its columns go once around the globe: behind the last one comes column 0 again */
     double quantum; /* step between representable heights (1 for an integer DEM without scale), 0 for continuous ones */
+    /* What is decoded at once, from the grid's corner on: whole blocks are read with least work. 0: no matter. */
+    int64_t block_width, block_height;
     const char *name;               /* what to call it in messages: the file, mostly; never NULL */
     const tl_parameter *parameters; /* how it was made; NULL when parameter_count is 0 */
     size_t parameter_count;

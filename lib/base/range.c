@@ -48,7 +48,7 @@ static void join_bands(const tl_source_info *info, const band_range *bands, uint
 
 tl_status tl_source_range(const tl_source *source, const tl_run *run, tl_range *out, tl_error *error)
 {
-    uint64_t count = tl_scan_bands(source);
+    uint64_t count = tl_scan_items(source);
     band_range *bands = tl_alloc(count, sizeof *bands);
     if (!bands)
         return tl_fail_memory(error, source->info.name);

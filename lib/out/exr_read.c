@@ -245,6 +245,8 @@ static tl_status read_header(exr_source *self, tl_error *error)
     info->width = (int64_t)box.max.x - box.min.x + 1;
     info->height = (int64_t)box.max.y - box.min.y + 1;
     info->name = self->path;
+    info->block_width = self->tile_width;
+    info->block_height = self->tile_height;
     info->has_voids = true;
     if (info->width < 1 || info->height < 1)
         return tl_fail(error, TL_ERROR_DATA, "%s: the EXR holds no samples", self->path);

@@ -106,6 +106,8 @@ tl_source *scene_north_up(const tl_source *source, tl_error *error)
     bool upright = t[2] == 0 && t[4] == 0;
     n->columns = upright && t[1] < 0;
     n->rows = upright && t[5] > 0;
+    if (n->columns || n->rows)
+        n->source.info.block_width = n->source.info.block_height = 0; /* they do not begin at this corner */
     if (n->columns) {
         t[0] += t[1] * (double)(source->info.width - 1);
         t[1] = -t[1];

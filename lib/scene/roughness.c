@@ -11,13 +11,16 @@
 
 enum {
     BLOCK = 512,
-    MARGIN = FBM_DETAIL_BEFORE + FBM_DETAIL_AFTER,
+    /* Rasters of more work items than this are measured without the blocks that reach over an item's rim, one in ten,
+     * so that nothing is decoded twice. */
+    MARGIN_LIMIT = 64,
     MIN_BLOCKS = 64, /* fewer overlapping 2 x 2 blocks than this say nothing of a variance */
 };
 
 typedef struct measurement {
     const tl_source *dem;
     int64_t columns;
+    bool margins;          /* whether an item sees beyond its rim */
     fbm_detail (*sums)[2]; /* one pair a block of the raster, so that the order of adding is fixed */
 } measurement;
 
@@ -44,8 +47,9 @@ static tl_status measure_block(void *context, tl_parallel *loop, uint64_t item, 
     const measurement *m = context;
     const tl_source_info *info = &m->dem->info;
     int64_t x = (int64_t)item % m->columns * BLOCK, y = (int64_t)item / m->columns * BLOCK;
-    int64_t x0 = tl_int64_max(0, x - FBM_DETAIL_BEFORE), x1 = tl_int64_min(info->width, x + BLOCK + FBM_DETAIL_AFTER);
-    int64_t y0 = tl_int64_max(0, y - FBM_DETAIL_BEFORE), y1 = tl_int64_min(info->height, y + BLOCK + FBM_DETAIL_AFTER);
+    int64_t before = m->margins ? FBM_DETAIL_BEFORE : 0, after = m->margins ? FBM_DETAIL_AFTER : 0;
+    int64_t x0 = tl_int64_max(0, x - before), x1 = tl_int64_min(info->width, x + BLOCK + after);
+    int64_t y0 = tl_int64_max(0, y - before), y1 = tl_int64_min(info->height, y + BLOCK + after);
     tl_window window = {x0, y0, x1 - x0, y1 - y0};
     size_t samples = (size_t)(window.width * window.height);
     float *heights = tl_alloc(samples, 4 * sizeof *heights);
@@ -91,6 +95,7 @@ tl_status tl_roughness_measure(const tl_source *dem, const tl_run *run, tl_rough
     const tl_source_info *info = &dem->info;
     measurement m = {.dem = dem, .columns = tl_div_up(info->width, BLOCK)};
     int64_t blocks = m.columns * tl_div_up(info->height, BLOCK);
+    m.margins = blocks <= MARGIN_LIMIT;
     m.sums = calloc((size_t)blocks, sizeof *m.sums);
     if (!m.sums)
         return tl_fail_memory(error, info->name);
