@@ -432,7 +432,7 @@ static void place(field *f, int levels)
     info->height = refined_size(dem->height, levels, dem->type);
     info->level = levels;
     info->quantum = levels ? 0 : dem->quantum;
-    info->block_width = info->block_height = 0; /* whatever window is wanted is made */
+    info->block_width = info->block_height = 0;                           /* whatever window is wanted is made */
     info->wraps = dem->wraps && (dem->type == TL_RASTER_AREA || !levels); /* points end a cell before the first */
     double *t = info->georef.transform;
     if (dem->type == TL_RASTER_AREA) { /* the first cell's centre moves towards the corner */
