@@ -5,7 +5,7 @@
 #include "lib/base/size.h"
 
 /* Samples that a worker reads at once. */
-enum { PIECE_SAMPLES = 1 << 18 };
+enum { PIECE_SAMPLES = 1 << 18, ITEM_SIDE = 512 };
 
 typedef struct scan {
     const tl_source *source;
@@ -14,13 +14,19 @@ typedef struct scan {
     void *context;
 } scan;
 
-/* What one item is: a block of the source where it has blocks that are not whole rows, else a band of rows. */
+/* The least multiple of a block's side that is not below ITEM_SIDE. */
+static int64_t side_of_item(int64_t block)
+{
+    return block * tl_div_up(ITEM_SIDE, block);
+}
+
+/* What one item is: blocks of the source where it has blocks that are not whole rows, else a band of rows. */
 static void item_size(const tl_source *source, int64_t *width, int64_t *height)
 {
     const tl_source_info *info = &source->info;
-    bool blocks = info->block_width > 0 && info->block_width < info->width;
-    *width = blocks ? info->block_width : info->width;
-    *height = blocks ? info->block_height : tl_int64_max(1, PIECE_SAMPLES / info->width);
+    bool blocks = info->block_width > 0 && info->block_width < info->width && info->block_height > 0;
+    *width = blocks ? side_of_item(info->block_width) : info->width;
+    *height = blocks ? side_of_item(info->block_height) : tl_int64_max(1, PIECE_SAMPLES / info->width);
 }
 
 uint64_t tl_scan_items(const tl_source *source)
