@@ -659,6 +659,7 @@ void tl_framework_destroy(tl_framework *framework)
     free(framework->split);
     free(framework->points);
     free(framework->rank);
+    free(framework->ties);
     free(framework->heights);
     free(framework);
 }

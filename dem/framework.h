@@ -17,6 +17,11 @@
 
 enum { TL_BLOCK_LOG = 8, TL_BLOCK = 1 << TL_BLOCK_LOG };
 
+/* A triangle that ties in a sample which no cell draws: see framework_ties.c. */
+typedef struct tl_tie {
+    int32_t x[3], y[3];
+} tl_tie;
+
 struct tl_framework {
     tl_source_info info; /* of the DEM; what it points to is the framework's own */
     double max_error;
@@ -31,6 +36,8 @@ struct tl_framework {
     uint32_t *rank;           /* [row][block column]: number of points before */
     float *heights;           /* of the points, row by row */
     size_t point_count, isolated_count;
+    tl_tie *ties;
+    size_t tie_count;
 };
 
 static inline bool tl_bit(const uint64_t *bits, size_t words, int64_t x, int64_t y)
@@ -58,6 +65,10 @@ tl_status tl_framework_rises(const float *heights, int64_t width, int64_t height
 /* Fills in `points`, their number, rank and heights, and the number of isolated samples, from `split` and the DEM's
  * heights (width * height, NaN for voids). */
 tl_status tl_framework_find_points(tl_framework *framework, const float *dem, const tl_run *run, tl_error *error);
+
+/* Finds the ties of the valid samples that are not `joined`: bitmaps like those of the framework. Marks the samples of
+ * the ties as joined and as points. */
+tl_status tl_framework_tie(tl_framework *framework, const uint64_t *valid, uint64_t *joined, tl_error *error);
 
 /* A rectangle of the lattice whose triangles are decided together, coarser and coarser. */
 typedef struct tl_patch {

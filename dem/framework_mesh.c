@@ -24,20 +24,25 @@ static const uint32_t NO_POINT = UINT32_MAX;
 typedef struct finder {
     tl_framework *framework;
     const float *dem;
-    uint64_t *valid;    /* bits of three rows, by worker */
-    size_t *counts;     /* points by row */
-    uint64_t *isolated; /* by band */
+    uint64_t *valid, *joined; /* bitmaps; NULL where there are no voids. Joined: in some triangle */
+    size_t *counts;           /* points by row */
 } finder;
 
-static void valid_row(const finder *self, int64_t y, uint64_t *out)
+static tl_status find_valid_band(void *context, tl_parallel *loop, uint64_t item, unsigned worker, tl_error *error)
 {
+    const finder *self = context;
     const tl_source_info *info = &self->framework->info;
-    memset(out, 0, self->framework->words * sizeof *out);
-    if (y < 0 || y >= info->height)
-        return;
-    const float *z = self->dem + y * info->width;
-    for (int64_t x = 0; x < info->width; x++)
-        out[x >> 6] |= (uint64_t)!isnan(z[x]) << (x & 63);
+    (void)loop;
+    (void)worker;
+    (void)error;
+    int64_t y = (int64_t)item * BAND, end = tl_int64_min(y + BAND, info->height);
+    for (; y < end; y++) {
+        const float *z = self->dem + y * info->width;
+        uint64_t *out = self->valid + (size_t)y * self->framework->words;
+        for (int64_t x = 0; x < info->width; x++)
+            out[x >> 6] |= (uint64_t)!isnan(z[x]) << (x & 63);
+    }
+    return TL_OK;
 }
 
 /* The bits of the western (shifted up) or eastern neighbours of word w. */
@@ -76,49 +81,56 @@ static void mark_lattice_corners(tl_framework *framework)
     }
 }
 
-/* Keeps of row y's candidates (marks and lattice corners) those that are points. */
-static void find_row(const finder *self, const uint64_t *above, const uint64_t *here, const uint64_t *below, int64_t y,
-                     uint64_t *isolated)
+/* Keeps of row y's candidates (marks and lattice corners) those that are points; the row before the first and behind
+ * the last one is `none`. */
+static void find_row(const finder *self, int64_t y, const uint64_t *none)
 {
     tl_framework *framework = self->framework;
-    size_t words = framework->words, count = 0;
-    const uint64_t *split = framework->split + (size_t)y * words;
-    uint64_t *points = framework->points + (size_t)y * words;
+    size_t words = framework->words, row = (size_t)y * words;
+    const uint64_t *here = self->valid ? self->valid + row : NULL;
+    const uint64_t *above = y > 0 ? here - words : none, *below = y + 1 < framework->info.height ? here + words : none;
     for (size_t w = 0; w < words; w++) {
-        points[w] |= split[w];
-        if (here) {
-            uint64_t able = spanned(above, here, below, w, words);
-            points[w] &= able;
-            *isolated += (unsigned)__builtin_popcountll(here[w] & ~able);
-        }
-        count += (unsigned)__builtin_popcountll(points[w]);
+        framework->points[row + w] |= framework->split[row + w];
+        if (!here)
+            continue;
+        self->joined[row + w] = spanned(above, here, below, w, words);
+        framework->points[row + w] &= self->joined[row + w];
     }
-    self->counts[y] = count;
 }
 
 static tl_status find_band(void *context, tl_parallel *loop, uint64_t item, unsigned worker, tl_error *error)
 {
     finder *self = context;
     (void)loop;
-    (void)error;
-    size_t words = self->framework->words;
+    (void)worker;
     int64_t y = (int64_t)item * BAND, end = tl_int64_min(y + BAND, self->framework->info.height);
-    uint64_t *above = self->valid + worker * 3 * words, *here = above + words, *below = here + words;
-    if (self->framework->voids) {
-        valid_row(self, y - 1, above);
-        valid_row(self, y, here);
-    }
-    for (; y < end; y++) {
-        if (!self->framework->voids) {
-            find_row(self, NULL, NULL, NULL, y, NULL);
-            continue;
-        }
-        valid_row(self, y + 1, below);
-        find_row(self, above, here, below, y, &self->isolated[item]);
-        uint64_t *oldest = above;
-        above = here, here = below, below = oldest;
-    }
+    uint64_t *none = calloc(self->framework->words, sizeof *none);
+    if (!none)
+        return tl_fail_memory(error, "the framework");
+    for (; y < end; y++)
+        find_row(self, y, none);
+    free(none);
     return TL_OK;
+}
+
+static size_t count_bits(const uint64_t *words, size_t count)
+{
+    size_t bits = 0;
+    for (size_t w = 0; w < count; w++)
+        bits += (unsigned)__builtin_popcountll(words[w]);
+    return bits;
+}
+
+/* Ties in what lies alone, and counts what that leaves. */
+static tl_status tie_alone(finder *self, tl_error *error)
+{
+    tl_framework *framework = self->framework;
+    size_t words = framework->words * (size_t)framework->info.height, valid = count_bits(self->valid, words);
+    if (count_bits(self->joined, words) == valid)
+        return TL_OK;
+    tl_status status = tl_framework_tie(framework, self->valid, self->joined, error);
+    framework->isolated_count = valid - count_bits(self->joined, words);
+    return status;
 }
 
 /* Ranks and heights of a band of rows; counts[y] is the number of points before row y by now. */
@@ -144,18 +156,15 @@ static tl_status collect_band(void *context, tl_parallel *loop, uint64_t item, u
     return TL_OK;
 }
 
-/* Turns the rows' counts into sums of those before, and checks that indices of 32 bits are enough. */
+/* Counts the points before each row, and checks that indices of 32 bits are enough. */
 static tl_status sum_counts(finder *self, tl_error *error)
 {
     tl_framework *framework = self->framework;
     size_t sum = 0;
     for (int64_t y = 0; y < framework->info.height; y++) {
-        size_t count = self->counts[y];
         self->counts[y] = sum;
-        sum += count;
+        sum += count_bits(framework->points + (size_t)y * framework->words, framework->words);
     }
-    for (int64_t i = 0; i < tl_div_up(framework->info.height, BAND); i++)
-        framework->isolated_count += self->isolated[i];
     framework->point_count = sum;
     if (sum > UINT32_MAX - 1)
         return tl_fail(error, TL_ERROR_ARGUMENT, "%s: %zu points are more than a mesh can have; use a larger max_error",
@@ -168,7 +177,13 @@ static tl_status find_points(finder *self, const tl_run *run, tl_error *error)
     tl_framework *framework = self->framework;
     uint64_t bands = (uint64_t)tl_div_up(framework->info.height, BAND);
     mark_lattice_corners(framework);
-    tl_status status = tl_parallel_for(run, bands, 0, find_band, self, error);
+    tl_status status = TL_OK;
+    if (framework->voids)
+        status = tl_parallel_for(run, bands, 0, find_valid_band, self, error);
+    if (status == TL_OK)
+        status = tl_parallel_for(run, bands, 0, find_band, self, error);
+    if (status == TL_OK && framework->voids)
+        status = tie_alone(self, error);
     if (status == TL_OK)
         status = sum_counts(self, error);
     if (status != TL_OK)
@@ -183,15 +198,17 @@ static tl_status find_points(finder *self, const tl_run *run, tl_error *error)
 tl_status tl_framework_find_points(tl_framework *framework, const float *dem, const tl_run *run, tl_error *error)
 {
     finder self = {.framework = framework, .dem = dem};
-    uint64_t bands = (uint64_t)tl_div_up(framework->info.height, BAND);
-    self.valid = tl_alloc(3 * framework->words, tl_parallel_workers(run, bands) * sizeof *self.valid);
+    size_t words = framework->words * (size_t)framework->info.height; /* as many as the bitmaps of the framework */
     self.counts = tl_alloc((size_t)framework->info.height, sizeof *self.counts);
-    self.isolated = calloc(bands, sizeof *self.isolated);
-    tl_status status = self.valid && self.counts && self.isolated ? find_points(&self, run, error)
-                                                                  : tl_fail_memory(error, "the framework");
+    if (framework->voids) {
+        self.valid = calloc(words, sizeof *self.valid);
+        self.joined = calloc(words, sizeof *self.joined);
+    }
+    bool ready = self.counts && (!framework->voids || (self.valid && self.joined));
+    tl_status status = ready ? find_points(&self, run, error) : tl_fail_memory(error, "the framework");
     free(self.valid);
+    free(self.joined);
     free(self.counts);
-    free(self.isolated);
     return status;
 }
 
@@ -445,6 +462,16 @@ static size_t draw_whole_top(const tl_framework *framework, uint32_t *indices)
     return to.count;
 }
 
+static void draw_ties(const tl_framework *framework, uint32_t *indices)
+{
+    sink to = {indices, 0};
+    for (size_t i = 0; i < framework->tie_count; i++) {
+        const tl_tie *tie = &framework->ties[i];
+        emit(&to, rank_at(framework, tie->x[0], tie->y[0]), rank_at(framework, tie->x[1], tie->y[1]),
+             rank_at(framework, tie->x[2], tie->y[2]));
+    }
+}
+
 static void place_vertices(const tl_framework *framework, tl_vertex *out)
 {
     const uint64_t *word = framework->points;
@@ -480,11 +507,13 @@ static tl_status draw_all(drawing *self, const tl_run *run, tl_mesh **out, tl_er
         self->counts[i] = sum;
         sum += count;
     }
-    tl_mesh *mesh = status == TL_OK ? tl_mesh_create(framework->point_count, sum, &framework->info, error) : NULL;
+    size_t all = sum + framework->tie_count;
+    tl_mesh *mesh = status == TL_OK ? tl_mesh_create(framework->point_count, all, &framework->info, error) : NULL;
     if (!mesh)
         return status == TL_OK ? TL_ERROR_MEMORY : status;
     place_vertices(framework, mesh->vertices);
     draw_whole_top(framework, mesh->indices);
+    draw_ties(framework, mesh->indices + 3 * sum);
     self->indices = mesh->indices;
     status = tl_parallel_for(run, blocks, 0, draw_item, self, error);
     if (status == TL_OK)

@@ -392,7 +392,9 @@ TL_API void tl_framework_destroy(tl_framework *framework);
 
 /* Number of characteristic points. */
 TL_API size_t tl_framework_point_count(const tl_framework *framework);
-/* Valid samples that are no corner of any triangle, because they have too few valid neighbours to span one. */
+/* Valid samples that are in no triangle. One that no cell with three valid corners holds, as at the end of a row one
+ * sample wide, is tied in by a triangle that reaches up to three samples far and passes no other sample; what is left
+ * is farther off, or would pass voids. */
 TL_API size_t tl_framework_isolated_count(const tl_framework *framework);
 /* Whether sample (i, j), which must lie in the grid, is a characteristic point. */
 TL_API bool tl_framework_has_point(const tl_framework *framework, int64_t i, int64_t j);

@@ -52,15 +52,34 @@ static float terrain_height(terrain kind, int x, int y, const double wave[4])
     }
 }
 
-typedef enum voids { VOIDS_NONE, VOIDS_FEW, VOIDS_MANY, VOIDS_BLOCKS, VOIDS_CHECKERBOARD, VOIDS_KINDS } voids;
+typedef enum voids {
+    VOIDS_NONE,
+    VOIDS_FEW,
+    VOIDS_THIRD,
+    VOIDS_HALF,
+    VOIDS_MANY,
+    VOIDS_BLOCKS,
+    VOIDS_CHECKERBOARD,
+    VOIDS_ROWS,
+    VOIDS_DIAGONALS,
+    VOIDS_KINDS
+} voids;
 
 static bool is_void(voids kind, int x, int y)
 {
     switch (kind) {
     case VOIDS_FEW:
         return random_below(40) == 0;
+    case VOIDS_THIRD:
+        return random_below(10) < 3;
+    case VOIDS_HALF:
+        return random_below(2);
     case VOIDS_MANY:
-        return random_below(5) < 3;
+        return random_below(10) < 7;
+    case VOIDS_ROWS: /* a plain with single rows and columns that grow out of it and now and then break off */
+        return x > 20 && y > 20 && x % 3 && y % 4 && random_below(30);
+    case VOIDS_DIAGONALS:
+        return (x + y) % 5 && (x - y) % 7 && random_below(40);
     case VOIDS_BLOCKS: /* a third of the plane, with straight and slanting rims */
         return (x / 11 + y / 7) % 3 == 0 || (x + y) % 60 < 9;
     case VOIDS_CHECKERBOARD:
@@ -162,35 +181,54 @@ static int cell_corners(const grid *of, int x, int y)
     return valid_at(of, x, y) + valid_at(of, x + 1, y) + valid_at(of, x, y + 1) + valid_at(of, x + 1, y + 1);
 }
 
+/* Whether a sample is valid, but no cell has it and two more valid corners: cells leave it to ties. */
+static bool is_alone(const grid *of, int x, int y)
+{
+    return valid_at(of, x, y) && cell_corners(of, x - 1, y - 1) < 3 && cell_corners(of, x, y - 1) < 3 &&
+           cell_corners(of, x - 1, y) < 3 && cell_corners(of, x, y) < 3;
+}
+
+static bool is_tie(const grid *of, const tl_mesh *mesh, size_t triangle)
+{
+    for (int k = 0; k < 3; k++) {
+        const tl_vertex *v = &mesh->vertices[mesh->indices[3 * triangle + (size_t)k]];
+        if (is_alone(of, v->i, v->j))
+            return true;
+    }
+    return false;
+}
+
 /* Every triangle within the bound; drawn area, covered and isolated samples as the valid cells say. */
 static void check_surface(const grid *of, const tl_framework *framework, const tl_mesh *mesh, double max_error)
 {
-    size_t samples = (size_t)of->width * (size_t)of->height, isolated = 0, uncovered = 0;
+    size_t samples = (size_t)of->width * (size_t)of->height, alone = 0, uncovered = 0;
     unsigned char *covered = calloc(samples, 1);
     long area = 0, expected = 0;
     for (size_t t = 0; t < mesh->triangle_count; t++) {
         const tl_vertex *v = mesh->vertices;
         const uint32_t *k = mesh->indices + 3 * t;
         check_triangle(of, v + k[0], v + k[1], v + k[2], max_error, covered);
-        area -= area2(v + k[0], v + k[1], v[k[2]].i, v[k[2]].j);
+        long own = -area2(v + k[0], v + k[1], v[k[2]].i, v[k[2]].j);
+        assert_true(own == 1 || !is_tie(of, mesh, t));
+        area += is_tie(of, mesh, t) ? 0 : own;
     }
     for (int y = 0; y < of->height; y++)
         for (int x = 0; x < of->width; x++) {
             int corners = cell_corners(of, x, y);
             expected += corners == 4 ? 2 : corners == 3;
             uncovered += valid_at(of, x, y) && !covered[y * of->width + x];
-            isolated += valid_at(of, x, y) && cell_corners(of, x - 1, y - 1) < 3 && cell_corners(of, x, y - 1) < 3 &&
-                        cell_corners(of, x - 1, y) < 3 && cell_corners(of, x, y) < 3;
+            alone += is_alone(of, x, y);
         }
     assert_int_equal(area, expected);
-    assert_int_equal(uncovered, isolated);
-    assert_int_equal(tl_framework_isolated_count(framework), isolated);
+    assert_true(uncovered <= alone);
+    assert_int_equal(tl_framework_isolated_count(framework), uncovered);
     free(covered);
 }
 
 typedef struct edge {
     uint32_t low, high;
     int direction;
+    bool of_tie;
 } edge;
 
 static int compare_edges(const void *a, const void *b)
@@ -199,6 +237,11 @@ static int compare_edges(const void *a, const void *b)
     if (p->low != q->low)
         return p->low < q->low ? -1 : 1;
     return p->high < q->high ? -1 : p->high > q->high;
+}
+
+static int common_factor(int a, int b)
+{
+    return b ? common_factor(b, a % b) : a;
 }
 
 /* An edge with one triangle: the raster's rim, or one unit long beside a cell that cannot be drawn there. */
@@ -225,13 +268,17 @@ static void check_topology(const grid *of, const tl_mesh *mesh)
         uint32_t a = mesh->indices[k], b = mesh->indices[k % 3 == 2 ? k - 2 : k + 1];
         assert_true(a < mesh->vertex_count && a != b);
         used[a] = 1;
-        edges[k] = a < b ? (edge){a, b, 1} : (edge){b, a, -1};
+        edges[k] = a < b ? (edge){a, b, 1, is_tie(of, mesh, k / 3)} : (edge){b, a, -1, is_tie(of, mesh, k / 3)};
+        const tl_vertex *from = &mesh->vertices[a], *to = &mesh->vertices[b]; /* ties pass no sample */
+        assert_true(!edges[k].of_tie || common_factor(abs(from->i - to->i), abs(from->j - to->j)) == 1);
     }
     for (size_t v = 0; v < mesh->vertex_count; v++)
         assert_true(used[v]);
     qsort(edges, count, sizeof *edges, compare_edges);
     for (size_t k = 0; k < count; k++) {
         bool twin = k + 1 < count && compare_edges(&edges[k], &edges[k + 1]) == 0;
+        if (!twin && edges[k].of_tie)
+            continue;
         if (!twin) {
             check_open_edge(of, &mesh->vertices[edges[k].low], &mesh->vertices[edges[k].high]);
             continue;
@@ -260,12 +307,104 @@ static void check_points(const grid *of, const tl_framework *framework, const tl
     assert_int_equal(next, mesh->vertex_count);
 }
 
+/* ---- Ties, by all pairs of triangles ----------------------------------------------------------------- */
+
+enum { TIE_REACH = 3 };
+
+static bool edge_separates(const tl_vertex t[3], const tl_vertex u[3])
+{
+    for (int k = 0; k < 3; k++) {
+        int outer = 0;
+        for (int i = 0; i < 3; i++)
+            outer += area2(&t[k], &t[(k + 1) % 3], u[i].i, u[i].j) >= 0;
+        if (outer == 3)
+            return true;
+    }
+    return false;
+}
+
+/* Whether two triangles, both counter-clockwise where rows go down, share area. */
+static bool overlap(const tl_vertex t[3], const tl_vertex u[3])
+{
+    return !edge_separates(t, u) && !edge_separates(u, t);
+}
+
+static void corners_of(const tl_mesh *mesh, size_t triangle, tl_vertex out[3])
+{
+    for (int k = 0; k < 3; k++)
+        out[k] = mesh->vertices[mesh->indices[3 * triangle + (size_t)k]];
+}
+
+/* The triangles that may share area with ties of a sample; returns their number. */
+static size_t triangles_near(const tl_mesh *mesh, int x, int y, uint32_t *out)
+{
+    size_t count = 0;
+    for (size_t t = 0; t < mesh->triangle_count; t++) {
+        tl_vertex c[3];
+        corners_of(mesh, t, c);
+        int left = 0, right = 0, above = 0, below = 0;
+        for (int k = 0; k < 3; k++) {
+            left += c[k].i <= x - TIE_REACH, right += c[k].i >= x + TIE_REACH;
+            above += c[k].j <= y - TIE_REACH, below += c[k].j >= y + TIE_REACH;
+        }
+        if (left < 3 && right < 3 && above < 3 && below < 3)
+            out[count++] = (uint32_t)t;
+    }
+    return count;
+}
+
+/* Whether a triangle of twice the area 1 fits between sample (x, y), a and b. */
+static bool tie_fits(const grid *of, const tl_mesh *mesh, const uint32_t *near, size_t count, const tl_vertex c[3])
+{
+    if (abs(c[1].i - c[2].i) > TIE_REACH || abs(c[1].j - c[2].j) > TIE_REACH)
+        return false;
+    if (area2(&c[0], &c[1], c[2].i, c[2].j) != -1 || !valid_at(of, c[1].i, c[1].j) || !valid_at(of, c[2].i, c[2].j))
+        return false;
+    for (size_t n = 0; n < count; n++) {
+        tl_vertex other[3];
+        corners_of(mesh, near[n], other);
+        if (overlap(c, other))
+            return false;
+    }
+    return true;
+}
+
+/* No tie shares area with any triangle; and no sample that is left out could have been tied in. */
+static void check_ties(const grid *of, const tl_framework *framework, const tl_mesh *mesh)
+{
+    enum { SIDE = 2 * TIE_REACH + 1 };
+    uint32_t *near = malloc((mesh->triangle_count + 1) * sizeof *near);
+    for (size_t t = 0; t < mesh->triangle_count; t++) {
+        tl_vertex own[3], other[3];
+        corners_of(mesh, t, own);
+        size_t count = is_tie(of, mesh, t) ? triangles_near(mesh, own[0].i, own[0].j, near) : 0;
+        for (size_t n = 0; n < count; n++) {
+            corners_of(mesh, near[n], other);
+            assert_true(near[n] == t || !overlap(own, other));
+        }
+    }
+    for (int y = 0; y < of->height; y++)
+        for (int x = 0; x < of->width; x++) {
+            if (!valid_at(of, x, y) || !is_alone(of, x, y) || tl_framework_has_point(framework, x, y))
+                continue;
+            size_t count = triangles_near(mesh, x, y, near);
+            for (int k = 0; k < SIDE * SIDE * SIDE * SIDE; k++) {
+                tl_vertex c[3] = {{x, y, 0},
+                                  {x + k % SIDE - TIE_REACH, y + k / SIDE % SIDE - TIE_REACH, 0},
+                                  {x + k / SIDE / SIDE % SIDE - TIE_REACH, y + k / SIDE / SIDE / SIDE - TIE_REACH, 0}};
+                assert_false(tie_fits(of, mesh, near, count, c));
+            }
+        }
+    free(near);
+}
+
 static tl_mesh *check_all(const grid *of, const tl_framework *framework, double max_error)
 {
     tl_mesh *mesh = draw(framework);
     check_surface(of, framework, mesh, max_error);
     check_topology(of, mesh);
     check_points(of, framework, mesh);
+    check_ties(of, framework, mesh);
     return mesh;
 }
 
@@ -419,19 +558,23 @@ static naive naive_build(const grid *of, double max_error)
     return self;
 }
 
-/* The mesh is, triangle by triangle, the one of the definition. */
+/* The mesh without its ties is, triangle by triangle, the one of the definition. */
 static void check_against_definition(const grid *of, const tl_mesh *mesh, double max_error)
 {
     naive expected = naive_build(of, max_error);
     uint64_t *keys = malloc((mesh->triangle_count + 1) * sizeof *keys);
+    size_t count = 0;
     for (size_t t = 0; t < mesh->triangle_count; t++) {
         const tl_vertex *v[3];
+        if (is_tie(of, mesh, t))
+            continue;
         for (int k = 0; k < 3; k++)
             v[k] = &mesh->vertices[mesh->indices[3 * t + (size_t)k]];
-        keys[t] = naive_key(&expected, (place){v[0]->i, v[0]->j}, (place){v[1]->i, v[1]->j}, (place){v[2]->i, v[2]->j});
+        keys[count++] =
+            naive_key(&expected, (place){v[0]->i, v[0]->j}, (place){v[1]->i, v[1]->j}, (place){v[2]->i, v[2]->j});
     }
-    qsort(keys, mesh->triangle_count, sizeof *keys, compare_keys);
-    assert_int_equal(mesh->triangle_count, expected.count);
+    qsort(keys, count, sizeof *keys, compare_keys);
+    assert_int_equal(count, expected.count);
     assert_memory_equal(keys, expected.drawn, expected.count * sizeof *keys);
     free(keys);
     free(expected.needed);
@@ -569,7 +712,7 @@ static void frameworkDoesNotDependOnThreads(void **state)
     (void)state;
     for (size_t k = 0; k < sizeof border_sizes / sizeof *border_sizes; k++) {
         random_state = k;
-        grid of = make_grid(border_sizes[k][0], border_sizes[k][1], TERRAIN_HILLS, k % 2 ? VOIDS_FEW : VOIDS_NONE);
+        grid of = make_grid(border_sizes[k][0], border_sizes[k][1], TERRAIN_HILLS, (voids)(k % VOIDS_KINDS));
         tl_framework *one = build(&of, 4, 1), *many = build(&of, 4, 5);
         tl_mesh *a = draw(one), *b = draw(many);
         assert_int_equal(a->vertex_count, b->vertex_count);
@@ -612,11 +755,28 @@ typedef struct degenerate {
 static void frameworkCountsDegenerateGrids(void **state)
 {
     static const degenerate cases[] = {
-        {1, 1, "x", 0, 0, 1},         {1, 1, ".", 0, 0, 0},         {5, 1, "xx.xx", 0, 0, 4},
-        {1, 4, "xxxx", 0, 0, 4},      {2, 2, "xxxx", 2, 4, 0},      {2, 2, ".xxx", 1, 3, 0},
-        {2, 2, "x.xx", 1, 3, 0},      {2, 2, "x..x", 0, 0, 2},      {2, 2, "....", 0, 0, 0},
-        {3, 3, "xxxxxxxxx", 2, 4, 0}, {3, 3, "xxxx.xxxx", 4, 8, 0}, {3, 3, ".x.x.x.x.", 0, 0, 4},
-        {3, 3, "....x....", 0, 0, 1}, {3, 2, "xxxxxx", 3, 5, 0},    {4, 4, "................", 0, 0, 0},
+        {1, 1, "x", 0, 0, 1},
+        {1, 1, ".", 0, 0, 0},
+        {5, 1, "xx.xx", 0, 0, 4},
+        {1, 4, "xxxx", 0, 0, 4},
+        {2, 2, "xxxx", 2, 4, 0},
+        {2, 2, ".xxx", 1, 3, 0},
+        {2, 2, "x.xx", 1, 3, 0},
+        {2, 2, "x..x", 0, 0, 2},
+        {2, 2, "....", 0, 0, 0},
+        {3, 3, "xxxxxxxxx", 2, 4, 0},
+        {3, 3, "xxxx.xxxx", 4, 8, 0},
+        {3, 3, ".x.x.x.x.", 0, 0, 4},
+        {3, 3, "....x....", 0, 0, 1},
+        {3, 2, "xxxxxx", 3, 5, 0},
+        {4, 4, "................", 0, 0, 0},
+        /* ties: a row's end, of one sample and of two; beyond a corner; three that nothing else holds, and three that
+         * span too much */
+        {4, 3, "x...xxx.x...", 2, 4, 0},
+        {5, 3, "x....xxxx......", 3, 5, 0},
+        {4, 3, "xx..xx....x.", 3, 5, 0},
+        {4, 2, "x.....xx", 1, 3, 0},
+        {4, 2, "x..x.x..", 0, 0, 3},
     };
     (void)state;
     for (size_t k = 0; k < sizeof cases / sizeof *cases; k++) {
