@@ -20,7 +20,7 @@ typedef struct facts {
     const tl_source_info *info;
     tl_dem_details details; /* of a GeoTIFF only */
     bool has_details;
-    const tl_source *source;
+    const tl_source *source; /* the files as they are */
     tl_range range;
     tl_roughness roughness;
     tl_suspect suspects[TL_MAX_SUSPECTS];
@@ -384,7 +384,7 @@ static int inform(const settings *set, const arguments *inputs)
     const tl_source *source = opened.source;
     if (!source)
         return command_failed(&bar, &error);
-    facts f = {.info = &source->info, .source = source};
+    facts f = {.info = &source->info, .source = opened.file};
     f.has_window = set->window != NULL;
     if (set->window && !parse_window(set->window, f.info, &f.window)) {
         progress_end(&bar);

@@ -64,12 +64,16 @@ tl_run command_run(const common *options, progress *bar)
                         (unsigned)options->threads);
 }
 
+size_t command_bytes(const common *options)
+{
+    return (size_t)(options->memory ? options->memory : DEFAULT_MEMORY) << 20;
+}
+
 static tl_source *open_files(const common *options, const arguments *inputs, const tl_run *quietly, tl_error *error)
 {
     const tl_dem_options dem = {.band = (unsigned)options->band,
                                 .feather = options->feather,
-                                .memory = (size_t)(options->memory ? options->memory : DEFAULT_MEMORY)
-                                          << 18, /* a quarter */
+                                .memory = command_bytes(options) / 4,
                                 .run = quietly};
     if (inputs->count == 1 && !options->feather && !options->band)
         return tl_open_with(inputs->names[0], &dem, error);
@@ -97,17 +101,29 @@ static bool void_options(const common *options, const tl_run *run, tl_void_optio
     return false;
 }
 
+/* Puts a source over the last one; NULL: it could not be made, and nothing can be used. */
+static void put_over(opened_input *opened, tl_source *made)
+{
+    if (made && made != opened->source)
+        opened->steps[opened->step_count++] = made;
+    opened->source = made;
+}
+
 opened_input command_open(const common *options, const arguments *inputs, const tl_run *run, tl_error *error)
 {
     /* opening has no progress to speak of */
     const tl_run quietly = {.threads = run->threads, .cancel = run->cancel};
+    const tl_geoid_options geoid = {.grid = options->geoid, .memory = command_bytes(options) / 16};
     tl_void_options voids;
     opened_input opened = {0};
     if (void_options(options, run, &voids, error))
-        opened.file = open_files(options, inputs, &quietly, error);
-    opened.source = opened.file;
-    if (opened.file && (voids.rule != TL_VOIDS_KEEP || voids.nodata_given))
-        opened.source = tl_voids_create(opened.file, &voids, error);
+        put_over(&opened, open_files(options, inputs, &quietly, error));
+    opened.file = opened.source;
+    /* a height that is given to voids counts from where the file's heights do */
+    if (opened.source && (voids.rule != TL_VOIDS_KEEP || voids.nodata_given))
+        put_over(&opened, tl_voids_create(opened.source, &voids, error));
+    if (opened.source && geoid.grid && strcmp(geoid.grid, "none") != 0)
+        put_over(&opened, tl_geoid_create(opened.source, &geoid, error));
     if (!opened.source)
         command_close(&opened);
     return opened;
@@ -115,9 +131,8 @@ opened_input command_open(const common *options, const arguments *inputs, const 
 
 void command_close(opened_input *opened)
 {
-    if (opened->source != opened->file)
-        tl_source_destroy(opened->source);
-    tl_source_destroy(opened->file);
+    while (opened->step_count)
+        tl_source_destroy(opened->steps[--opened->step_count]);
     *opened = (opened_input){0};
 }
 

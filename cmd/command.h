@@ -17,13 +17,14 @@ typedef struct command {
 
 extern const command command_info, command_simplify, command_synth, command_preview, command_noise;
 
-enum { DEFAULT_MEMORY = 512 };
+enum { DEFAULT_MEMORY = 512, OPENED_STEPS = 4 };
 
 /* Options that most commands have. */
 typedef struct common {
     const char *output;
     bool overwrite, quiet, feather;
     const char *voids; /* keep, fill or a number */
+    const char *geoid; /* none, egm96 or a file */
     double nodata;
     bool nodata_given;
     int64_t band; /* 0: the first */
@@ -53,6 +54,16 @@ typedef struct common {
          NULL,                                                                                                        \
          "RULE",                                                                                                      \
          "keep; fill, by a smooth surface from the rim; or a height for all (default: keep)",                         \
+         0,                                                                                                           \
+         0,                                                                                                           \
+         NULL},                                                                                                       \
+        {"geoid",                                                                                                     \
+         0,                                                                                                           \
+         OPTION_TEXT,                                                                                                 \
+         &(c).geoid,                                                                                                  \
+         NULL,                                                                                                        \
+         "GEOID",                                                                                                     \
+         "what heights count from, to make them ellipsoidal: none, egm96 or a grid FILE (default: none)",             \
          0,                                                                                                           \
          0,                                                                                                           \
          NULL},                                                                                                       \
@@ -103,12 +114,16 @@ bool command_begin(const command *self, int argc, const char **argv, bool help, 
 
 /* The tl_run of a command; reports to *bar. */
 tl_run command_run(const common *options, progress *bar);
-/* What a command reads: files, and what --voids and --nodata make of them. */
+/* What a command reads: files, and what the options make of them, one source over the other. */
 typedef struct opened_input {
     tl_source *source; /* to be used; NULL: could not be opened */
-    tl_source *file;
+    tl_source *file;   /* as it is */
+    tl_source *steps[OPENED_STEPS];
+    int step_count;
 } opened_input;
 
+/* What --memory gives. */
+size_t command_bytes(const common *options);
 /* Opens the inputs as one source: an EXR, or elevation models. */
 opened_input command_open(const common *options, const arguments *inputs, const tl_run *run, tl_error *error);
 void command_close(opened_input *opened);

@@ -1,6 +1,7 @@
 /* CRSs from GeoTIFF keys and from text. libgeotiff makes sense of the keys, PROJ of everything else. */
 #include "dem/crs.h"
 
+#include "dem/crs_ellipsoidal.h"
 #include "dem/crs_map.h"
 #include "dem/geokeys.h"
 #include "dem/text.h"
@@ -46,6 +47,20 @@ static PJ *horizontal(PJ_CONTEXT *context, PJ *crs)
         else
             break;
     }
+    return crs;
+}
+
+/* A CRS that lost its code with its third axis, with the code again; the CRS itself where EPSG has no other of the same
+ * name and meaning. */
+static PJ *with_code(PJ_CONTEXT *context, PJ *crs)
+{
+    int *confidence = NULL;
+    PJ_OBJ_LIST *found =
+        crs && !proj_get_id_code(crs, 0) ? proj_identify(context, crs, "EPSG", NULL, &confidence) : NULL;
+    if (found && proj_list_get_count(found) && confidence && confidence[0] == 100)
+        crs = replace(crs, proj_list_get(context, found, 0));
+    proj_int_list_destroy(confidence);
+    proj_list_destroy(found);
     return crs;
 }
 
@@ -173,7 +188,7 @@ static bool read_heights(PJ_CONTEXT *context, const PJ *whole, PJ *horizontal_cr
         proj_destroy(rebuilt);
         proj_destroy(vertical);
     } else if (axis_count(context, whole) == 3 && !altered) {
-        crs->vertical_name = strdup("ellipsoidal height");
+        crs->vertical_name = strdup(dem_ellipsoidal_name);
         crs->vertical_unit = unit_of_axis(context, whole, 2);
         good = crs->vertical_name && set_whole(context, whole, crs);
     }
@@ -189,6 +204,8 @@ static tl_status make_crs(PJ_CONTEXT *context, const PJ *whole, const char *path
                           tl_error *error)
 {
     PJ *crs = whole ? horizontal(context, proj_clone(context, whole)) : NULL;
+    if (whole && proj_get_type(whole) != PJ_TYPE_COMPOUND_CRS && axis_count(context, whole) == 3)
+        crs = with_code(context, crs);
     PJ_TYPE type = crs ? proj_get_type(crs) : PJ_TYPE_UNKNOWN;
     *to_degrees = 1;
     if (type != PJ_TYPE_PROJECTED_CRS && type != PJ_TYPE_GEOGRAPHIC_2D_CRS) {
@@ -455,14 +472,17 @@ static PJ *from_definition(PJ_CONTEXT *context, GTIFDefn *definition, const dem_
  * ellipsoids. */
 enum { FIRST_ELLIPSOID = 5001, LAST_ELLIPSOID = 5033, FIRST_OLD = 5101, LAST_OLD = 5106, OLD_TO_EPSG = 600 };
 
-/* The vertical CRS of a code; NULL where that is none. */
-static PJ *vertical_from_code(PJ_CONTEXT *context, unsigned code)
+/* The vertical CRS of a code; NULL where that is none. A code of longitudes, latitudes and heights, as 4979, stands for
+ * heights above their ellipsoid too. */
+static PJ *vertical_from_code(PJ_CONTEXT *context, unsigned code, bool *ellipsoidal)
 {
+    *ellipsoidal = code >= FIRST_ELLIPSOID && code <= LAST_ELLIPSOID;
     if (code >= FIRST_OLD && code <= LAST_OLD)
         code += OLD_TO_EPSG;
-    PJ *crs = is_code(code) ? from_code(context, code) : NULL;
+    PJ *crs = is_code(code) && !*ellipsoidal ? from_code(context, code) : NULL;
     if (!crs || proj_get_type(crs) == PJ_TYPE_VERTICAL_CRS)
         return crs;
+    *ellipsoidal = proj_get_type(crs) == PJ_TYPE_GEOGRAPHIC_3D_CRS;
     proj_destroy(crs);
     return NULL;
 }
@@ -497,11 +517,16 @@ static bool has_heights(const dem_geokeys *keys)
 static PJ *with_heights(PJ_CONTEXT *context, PJ *crs, const dem_geokeys *keys)
 {
     uint16_t code = 0, unit = 0;
+    bool ellipsoidal;
     dem_geokeys_short(keys, VerticalCSTypeGeoKey, &code);
     crs = horizontal(context, crs);
-    if (!crs || (code >= FIRST_ELLIPSOID && code <= LAST_ELLIPSOID))
-        return crs ? replace(crs, proj_crs_promote_to_3D(context, NULL, crs)) : NULL;
-    PJ *vertical = vertical_from_code(context, code);
+    if (!crs)
+        return NULL;
+    PJ *vertical = vertical_from_code(context, code, &ellipsoidal);
+    char citation[64] = "";
+    read_citation(keys, VerticalCitationGeoKey, "", citation, sizeof citation);
+    if (ellipsoidal || (!vertical && strcasecmp(citation, dem_ellipsoidal_name) == 0))
+        return dem_crs_promote(context, crs, dem_geokeys_height_unit(keys));
     if (!vertical)
         vertical = vertical_from_name(context, keys);
     if (!vertical)

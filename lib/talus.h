@@ -317,6 +317,22 @@ typedef struct tl_void_options {
  * any valid sample stay voids. Only the source's finest level is held. */
 TL_API tl_source *tl_voids_create(const tl_source *source, const tl_void_options *options, tl_error *error);
 
+/* ---- Heights above the ellipsoid ---------------------------------------------------------------- */
+
+typedef struct tl_geoid_options {
+    /* "egm96", from PROJ's own grids, or a file that PROJ reads as a grid of undulations: .gtx or GeoTIFF. */
+    const char *grid;
+    size_t memory; /* bytes of undulations kept for the next windows; 0: 16 MB */
+} tl_geoid_options;
+
+/* Heights above the ellipsoid of an elevation model whose heights count from a geoid (as "above sea level" does): each
+ * height plus the geoid's undulation at the sample, to 0.5 mm of what PROJ gives there, in the model's unit of height.
+ * The CRS becomes the one with ellipsoidal heights on the same horizontal CRS, and the raster has no quantum. It fails
+ * where place or CRS are not known or heights are ellipsoidal already, with "egm96" also where the CRS is not on the
+ * ellipsoid of WGS 84 or GRS 80; a file's undulations are taken for those above the CRS's own ellipsoid, on its own
+ * datum. Reading fails at heights that the grid does not cover. Coarser levels are those that `source` holds. */
+TL_API tl_source *tl_geoid_create(const tl_source *source, const tl_geoid_options *options, tl_error *error);
+
 /* ---- Meshes ------------------------------------------------------------------------------------ */
 
 /* A vertex at the sample (i, j) of a grid, height z in the grid's unit. */
