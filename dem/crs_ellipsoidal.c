@@ -21,7 +21,7 @@ static const double survey_foot = 1200.0 / 3937.0;
 /* EPSG's codes of the ellipsoids that GeoTIFF 1.0 lists heights for, and how those are counted. */
 enum { FIRST_LISTED = 7001, LAST_LISTED = 7033, TO_HEIGHTS = -2000 };
 
-int dem_ellipsoidal_key(int ellipsoid)
+static int listed_heights(int ellipsoid)
 {
     return ellipsoid >= FIRST_LISTED && ellipsoid <= LAST_LISTED ? ellipsoid + TO_HEIGHTS : 0;
 }
@@ -129,12 +129,28 @@ static int ellipsoid_code(PJ_CONTEXT *context, const tl_crs *crs)
                                                               : 0;
 }
 
-/* What tells in a GeoTIFF that heights count from the ellipsoid of `object`, a CRS of three dimensions. */
+/* What tells in a GeoTIFF that heights count from the ellipsoid of a CRS: the code of its longitudes, latitudes and
+ * heights, or of the ellipsoid. */
 static int key_of(PJ_CONTEXT *context, const PJ *object, const tl_crs *crs)
 {
     int own = proj_get_type(object) == PJ_TYPE_GEOGRAPHIC_3D_CRS ? code_of(object) : 0;
-    int listed = dem_ellipsoidal_key(ellipsoid_code(context, crs));
+    int listed = listed_heights(ellipsoid_code(context, crs));
     return own ? own : listed ? listed : KvUserDefined;
+}
+
+int dem_crs_vertical_key(const tl_crs *crs)
+{
+    if (!crs->vertical_name)
+        return 0;
+    if (strcmp(crs->vertical_name, dem_ellipsoidal_name) != 0)
+        return crs->vertical_epsg > 0 && crs->vertical_epsg < KvUserDefined ? crs->vertical_epsg : KvUserDefined;
+    PJ_CONTEXT *context = dem_proj_context();
+    PJ *object = context ? proj_create(context, crs->wkt) : NULL;
+    int key = object ? key_of(context, object, crs) : KvUserDefined;
+    proj_destroy(object);
+    if (context)
+        proj_context_destroy(context);
+    return key;
 }
 
 static bool is_vertical(uint16_t key)
@@ -150,7 +166,7 @@ static void add_key(tl_crs *to, const uint16_t entry[4])
     to->key_directory[3]++; /* the header's count */
 }
 
-static int unit_key(double metres)
+int dem_crs_unit_key(double metres)
 {
     return fabs(metres - 1) < 1e-12                ? Linear_Meter
            : fabs(metres - 0.3048) < 1e-12         ? Linear_Foot
@@ -181,7 +197,7 @@ static bool begin_keys(const tl_crs *from, tl_crs *to)
  * CRS without keys gets none. */
 static bool make_keys(PJ_CONTEXT *context, const PJ *object, const tl_crs *from, double metres, tl_crs *to)
 {
-    int code = key_of(context, object, from), unit = unit_key(metres);
+    int code = key_of(context, object, from), unit = dem_crs_unit_key(metres);
     if (from->key_directory_count < 4)
         return true;
     if (!begin_keys(from, to))

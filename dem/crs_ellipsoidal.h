@@ -13,8 +13,11 @@ extern const char dem_ellipsoidal_name[];
  * metres; the CRS itself where PROJ cannot. */
 PJ *dem_crs_promote(PJ_CONTEXT *context, PJ *crs, double metres);
 
-/* The code that GeoTIFF has for heights above an ellipsoid by its EPSG code; 0 where it has none. */
-int dem_ellipsoidal_key(int ellipsoid);
+/* What the keys of a GeoTIFF say of heights: the code of their CRS, user-defined (32767) where they have a name and no
+ * code; 0 where the CRS says nothing of them. */
+int dem_crs_vertical_key(const tl_crs *crs);
+/* The code of a unit of length, by its metres: 9001 to 9003; 0 for others. */
+int dem_crs_unit_key(double metres);
 
 /* A CRS with the horizontal part of `crs` and heights above its ellipsoid, in units of `metres`: another reference to
  * take. Fails where the heights of `crs` count from there already, or downwards, or where it has no WKT; `path` is for

@@ -16,11 +16,14 @@
 #include <pthread.h>
 #include <stdio.h>
 #include <string.h>
+#include <sys/stat.h>
 #include <unistd.h>
 
 enum {
     BLOCK = 256, /* samples on a side */
     BLOCK_SAMPLES = BLOCK * BLOCK,
+    SMALLEST = 16, /* samples on a side of what is looked up one by one, where a control grid would not pay */
+    SHARE = 16,    /* of a window's samples, one is the most that its control grid may look up */
     COARSEST = 62,
     KEPT_BYTES = 16 << 20,
 };
@@ -203,31 +206,51 @@ static tl_status block_window(const geoid_source *g, int level, int64_t column, 
     return status;
 }
 
-/* Fills the window's part of a block. */
-static tl_status fill_block(block_job *job, tl_window window, float *out, tl_error *error)
+/* The samples of a window, from its control grid, or one by one where there is none. */
+static void fill_rows(block_job *job, const dem_control_grid *grid, tl_window window, float *block)
 {
-    dem_control_function function = {
-        .components = 1, .evaluate = evaluate, .context = job, .weights = {1}, .tolerance = tolerance};
-    dem_control_grid *grid = NULL;
-    tl_status status = dem_control_grid_create(&function, window, BLOCK_SAMPLES / 4, &grid, error);
-    if (status != TL_OK)
-        return status;
     double i[BLOCK], j[BLOCK];
     size_t width = (size_t)window.width;
-    for (int64_t y = 0; y < window.height; y++) {
+    for (int64_t y = window.y; y < window.y + window.height; y++) {
         for (size_t k = 0; k < width; k++) {
             i[k] = (double)window.x + (double)k;
-            j[k] = (double)(window.y + y);
+            j[k] = (double)y;
         }
         if (grid)
             dem_control_grid_apply(grid, width, i, j, job->row);
         else
             undulations(job->g, job->lookup, job->level, width, i, j, job->row);
+        float *out = block + y % BLOCK * BLOCK + window.x % BLOCK;
         for (size_t k = 0; k < width; k++)
-            out[(size_t)y * BLOCK + k] = (float)job->row[k];
+            out[k] = (float)job->row[k];
     }
+}
+
+static tl_window quarter(tl_window w, int k)
+{
+    int64_t left = (w.width + 1) / 2, upper = (w.height + 1) / 2;
+    return (tl_window){k & 1 ? w.x + left : w.x, k & 2 ? w.y + upper : w.y, k & 1 ? w.width - left : left,
+                       k & 2 ? w.height - upper : upper};
+}
+
+/* Fills the window's part of a block. Where a kink goes through it, which would need a fine control grid all over, its
+ * quarters are filled one by one. */
+static tl_status fill_window(block_job *job, tl_window window, float *block, tl_error *error)
+{
+    dem_control_function function = {
+        .components = 1, .evaluate = evaluate, .context = job, .weights = {1}, .tolerance = tolerance};
+    dem_control_grid *grid = NULL;
+    bool small = window.width <= SMALLEST || window.height <= SMALLEST;
+    tl_status status = TL_OK;
+    if (!small)
+        status =
+            dem_control_grid_create(&function, window, (size_t)(window.width * window.height) / SHARE, &grid, error);
+    if (status == TL_OK && (small || grid))
+        fill_rows(job, grid, window, block);
+    for (int k = 0; status == TL_OK && !small && !grid && k < 4; k++)
+        status = fill_window(job, quarter(window, k), block, error);
     dem_control_grid_destroy(grid);
-    return TL_OK;
+    return status;
 }
 
 /* The block's undulations in metres, new. */
@@ -244,7 +267,7 @@ static tl_status make_block(const geoid_source *g, int level, int64_t column, in
         status = lookup_take(g, &job->lookup, error);
     }
     if (status == TL_OK) {
-        status = fill_block(job, window, made, error);
+        status = fill_window(job, window, made, error);
         lookup_give_back(g, job->lookup);
     }
     free(job);
@@ -395,6 +418,16 @@ static tl_status check_place(const tl_source_info *info, const char *grid, tl_er
                                       "%s: is refined already; take the geoid from the elevation model", info->name);
 }
 
+/* Whether the grid can be read: PROJ opens one late whose name it has met before. Places that a good grid does not
+ * cover are no matter here. */
+static bool is_readable(PJ *shift)
+{
+    proj_trans(shift, PJ_FWD, proj_coord(0, 0, 0, 0));
+    bool good = proj_errno(shift) != PROJ_ERR_INVALID_OP_FILE_NOT_FOUND_OR_INVALID;
+    proj_errno_reset(shift);
+    return good;
+}
+
 /* Opens the grid once; the lookup is the first idle one. */
 static tl_status try_grid(geoid_source *g, const char *id, tl_error *error)
 {
@@ -402,7 +435,7 @@ static tl_status try_grid(geoid_source *g, const char *id, tl_error *error)
     tl_status status = lookup_create(g, id, &l, error);
     if (status != TL_OK)
         return status;
-    if (!l->shift) {
+    if (!l->shift || !is_readable(l->shift)) {
         lookup_destroy(l);
         return TL_OK;
     }
@@ -427,8 +460,11 @@ static tl_status find_grid(geoid_source *g, tl_error *error)
     g->path = strdup(g->grid);
     if (!g->path)
         return tl_fail_memory(error, g->grid);
-    if (access(g->path, R_OK) != 0)
+    struct stat there;
+    if (access(g->path, R_OK) != 0 || stat(g->path, &there) != 0)
         return tl_fail_system(error, g->path, "read", errno);
+    if (!S_ISREG(there.st_mode))
+        return tl_fail(error, TL_ERROR_DATA, "%s: not a file; name a grid of geoid heights, .gtx or GeoTIFF", g->grid);
     status = try_grid(g, grid_alias, error);
     return status != TL_OK || g->id
                ? status

@@ -84,14 +84,19 @@ tl_status dem_geokeys_read(TIFF *tiff, const char *path, dem_geokeys *out, tl_er
     out->ascii = dem_tiff_text(tiff, TAG_ASCII);
     if (!out->ascii)
         out->ascii = calloc(1, 1);
-    if (!out->directory || !out->doubles || !out->ascii) {
-        dem_geokeys_finish(out);
-        return tl_fail_memory(error, path);
-    }
     out->directory_count = directory_count;
     out->double_count = double_count;
-    out->ascii_count = strlen(out->ascii);
-    keep_sound_entries(out);
+    return dem_geokeys_check(out, path, error);
+}
+
+tl_status dem_geokeys_check(dem_geokeys *keys, const char *path, tl_error *error)
+{
+    if (!keys->directory || !keys->doubles || !keys->ascii) {
+        dem_geokeys_finish(keys);
+        return tl_fail_memory(error, path);
+    }
+    keys->ascii_count = strlen(keys->ascii);
+    keep_sound_entries(keys);
     return TL_OK;
 }
 

@@ -13,6 +13,9 @@ typedef struct dem_geokeys {
 } dem_geokeys;
 
 tl_status dem_geokeys_read(TIFF *tiff, const char *path, dem_geokeys *out, tl_error *error);
+/* Drops the entries that are not sound from keys whose directory (of 4 numbers or more), doubles and text come from
+ * anywhere, each from malloc. Where one of them is NULL: out of memory, and all are freed. */
+tl_status dem_geokeys_check(dem_geokeys *keys, const char *path, tl_error *error);
 void dem_geokeys_finish(dem_geokeys *keys);
 
 /* Values of single keys; false, or NULL, where a key is not there as that type. */

@@ -1,5 +1,6 @@
 /* EXR heightfields through OpenEXRCore: one tiled part, one float channel "Y" (readers such as Blender take other names
  * for colours of black), tiles compressed in parallel and written in order. */
+#include "dem/crs_keys.h"
 #include "lib/base/error.h"
 #include "lib/base/georef.h"
 #include "lib/base/parallel.h"
@@ -11,6 +12,7 @@
 #include <math.h>
 #include <stdarg.h>
 #include <stdio.h>
+#include <stdlib.h>
 #include <string.h>
 #include <unistd.h>
 
@@ -63,6 +65,15 @@ static exr_compression_t compression_of(tl_compression compression)
     }
 }
 
+/* WKT does not hold all that GeoTIFF keys do, and keys cannot be made of every WKT: both are kept. */
+static exr_result_t set_keys(exr_context_t file, const tl_crs *crs)
+{
+    char *text = dem_crs_keys_text(crs);
+    exr_result_t code = text ? exr_attr_set_string(file, PART, "geotiff:keys", text) : EXR_ERR_SUCCESS;
+    free(text);
+    return code;
+}
+
 static exr_result_t set_georeference(exr_context_t file, const tl_source_info *info)
 {
     double t[6];
@@ -73,6 +84,8 @@ static exr_result_t set_georeference(exr_context_t file, const tl_source_info *i
         code = exr_attr_set_m33d(file, PART, "gdal:geoTransform", &matrix);
     if (code == EXR_ERR_SUCCESS && info->georef.crs && *tl_crs_wkt(info->georef.crs))
         code = exr_attr_set_string(file, PART, "gdal:crsWkt", tl_crs_wkt(info->georef.crs));
+    if (code == EXR_ERR_SUCCESS && info->georef.crs)
+        code = set_keys(file, info->georef.crs);
     if (code == EXR_ERR_SUCCESS)
         code = exr_attr_set_string(file, PART, "gdal:AREA_OR_POINT", info->type == TL_RASTER_AREA ? "Area" : "Point");
     if (code == EXR_ERR_SUCCESS)

@@ -1,5 +1,6 @@
 /* EXR heightfields that talus wrote, as sources. */
 #include "dem/crs.h"
+#include "dem/crs_keys.h"
 #include "lib/base/error.h"
 #include "lib/base/number.h"
 #include "lib/base/size.h"
@@ -196,6 +197,9 @@ static tl_status read_georeference(exr_source *self, tl_error *error)
     if (wkt && dem_crs_from_text(wkt, self->path, &crs, error) == TL_ERROR_MEMORY)
         return TL_ERROR_MEMORY;
     info->georef.crs = crs;
+    const char *keys = crs ? text_attribute(self->file, "geotiff:keys") : NULL;
+    if (keys && dem_crs_take_keys(crs, keys, self->path, error) != TL_OK)
+        return TL_ERROR_MEMORY;
     tl_status status = dem_georef_measure(&info->georef, info->width, info->height, error);
     info->wraps = status == TL_OK && dem_georef_goes_around(&info->georef, info->width);
     return status;

@@ -1,13 +1,16 @@
 /* GeoTIFF: tiled, float32 with deflate and the floating-point predictor, or bytes of validity. libtiff keeps the
  * directory; tiles are predicted and compressed here, in parallel, and handed to it in order. */
-#include "dem/crs.h"
+#include "dem/crs_ellipsoidal.h"
+#include "dem/crs_keys.h"
 #include "lib/base/error.h"
 #include "lib/base/parallel.h"
 #include "lib/base/size.h"
 #include "lib/out/out.h"
 
+#include <geotiff/geokeys.h>
 #include <geotiff/geotiff.h>
 #include <geotiff/geotiffio.h>
+#include <geotiff/geovalues.h>
 #include <geotiff/xtiffio.h>
 #include <libdeflate.h>
 #include <tiffio.h>
@@ -133,14 +136,74 @@ static bool copy_keys(GTIF *keys, const tl_crs *crs)
     return good;
 }
 
-static bool set_code(GTIF *keys, const tl_crs *crs)
+static bool set_short(GTIF *keys, geokey_t key, int value)
 {
-    bool good = GTIFKeySet(keys, GTModelTypeGeoKey, TYPE_SHORT, 1,
-                           crs->geographic ? ModelTypeGeographic : ModelTypeProjected) == 1;
-    if (good && crs->epsg > 0 && crs->epsg < 32767)
-        good = GTIFKeySet(keys, crs->geographic ? GeographicTypeGeoKey : ProjectedCSTypeGeoKey, TYPE_SHORT, 1,
-                          crs->epsg) == 1;
-    return good && GTIFKeySet(keys, GTCitationGeoKey, TYPE_ASCII, 0, crs->name) == 1;
+    return GTIFKeySet(keys, key, TYPE_SHORT, 1, value) == 1;
+}
+
+static bool set_double(GTIF *keys, geokey_t key, double value)
+{
+    return GTIFKeySet(keys, key, TYPE_DOUBLE, 1, value) == 1;
+}
+
+static bool set_text(GTIF *keys, geokey_t key, const char *text)
+{
+    return GTIFKeySet(keys, key, TYPE_ASCII, 0, text) == 1;
+}
+
+/* Longitude and latitude without a code: the ellipsoid is what matters. */
+static bool set_ellipsoid(GTIF *keys, const tl_crs *crs)
+{
+    return set_short(keys, GeographicTypeGeoKey, KvUserDefined) && set_text(keys, GeogCitationGeoKey, crs->name) &&
+           set_short(keys, GeogGeodeticDatumGeoKey, KvUserDefined) &&
+           set_short(keys, GeogAngularUnitsGeoKey, Angular_Degree) &&
+           set_short(keys, GeogEllipsoidGeoKey, KvUserDefined) &&
+           set_double(keys, GeogSemiMajorAxisGeoKey, crs->semi_major) &&
+           (crs->flattening > 0 ? set_double(keys, GeogInvFlatteningGeoKey, 1 / crs->flattening)
+                                : set_double(keys, GeogSemiMinorAxisGeoKey, crs->semi_major)) &&
+           set_double(keys, GeogPrimeMeridianLongGeoKey, dem_crs_prime_meridian(crs));
+}
+
+/* A map without a code: its definition in the words of ESRI, which GDAL understands too. */
+static bool set_definition(GTIF *keys, const tl_crs *crs)
+{
+    static const char mark[] = "ESRI PE String = ";
+    char *definition = dem_crs_esri_text(crs);
+    size_t room = definition ? strlen(definition) + sizeof mark : 0;
+    char *text = definition ? malloc(room) : NULL;
+    if (text)
+        snprintf(text, room, "%s%s", mark, definition);
+    bool good =
+        !text || (set_short(keys, ProjectedCSTypeGeoKey, KvUserDefined) && set_text(keys, PCSCitationGeoKey, text));
+    free(definition);
+    free(text);
+    return good;
+}
+
+static bool set_heights(GTIF *keys, const tl_crs *crs, double unit)
+{
+    int code = crs->vertical_name ? dem_crs_vertical_key(crs) : 0, unit_code = dem_crs_unit_key(unit);
+    bool good = true;
+    if (code > 0) {
+        good = set_short(keys, VerticalCSTypeGeoKey, code);
+        if (code == KvUserDefined)
+            good = good && set_text(keys, VerticalCitationGeoKey, crs->vertical_name);
+    }
+    if (unit_code && (code > 0 || unit_code != Linear_Meter))
+        good = good && set_short(keys, VerticalUnitsGeoKey, unit_code);
+    return good;
+}
+
+/* Keys for a CRS that came without. */
+static bool make_keys(GTIF *keys, const tl_crs *crs, double height_unit)
+{
+    bool good = set_short(keys, GTModelTypeGeoKey, crs->geographic ? ModelTypeGeographic : ModelTypeProjected) &&
+                set_text(keys, GTCitationGeoKey, crs->name);
+    if (crs->epsg > 0 && crs->epsg < KvUserDefined)
+        good = good && set_short(keys, crs->geographic ? GeographicTypeGeoKey : ProjectedCSTypeGeoKey, crs->epsg);
+    else
+        good = good && (crs->geographic ? set_ellipsoid(keys, crs) : set_definition(keys, crs));
+    return good && set_heights(keys, crs, height_unit);
 }
 
 static bool set_keys(TIFF *tiff, const tl_source_info *info)
@@ -149,10 +212,10 @@ static bool set_keys(TIFF *tiff, const tl_source_info *info)
     GTIF *keys = GTIFNew(tiff);
     if (!keys)
         return false;
-    bool good = GTIFKeySet(keys, GTRasterTypeGeoKey, TYPE_SHORT, 1,
-                           info->type == TL_RASTER_AREA ? RasterPixelIsArea : RasterPixelIsPoint) == 1;
+    bool good =
+        set_short(keys, GTRasterTypeGeoKey, info->type == TL_RASTER_AREA ? RasterPixelIsArea : RasterPixelIsPoint);
     if (good && crs)
-        good = crs->key_directory_count ? copy_keys(keys, crs) : set_code(keys, crs);
+        good = crs->key_directory_count ? copy_keys(keys, crs) : make_keys(keys, crs, info->georef.height_unit);
     good = good && GTIFWriteKeys(keys) == 1;
     GTIFFree(keys);
     return good;
