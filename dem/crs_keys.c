@@ -5,6 +5,7 @@
 #include "lib/base/error.h"
 #include "lib/base/size.h"
 
+#include <ctype.h>
 #include <inttypes.h>
 #include <stdio.h>
 #include <string.h>
@@ -39,7 +40,8 @@ static size_t read_numbers(const char **text, int base, uint64_t *numbers)
     const char *at = *text;
     while (*at && *at != ';') {
         char *end;
-        if (!strchr("0123456789abcdef ", *at) || count == MOST_NUMBERS)
+        at += *at == ' ';
+        if (!isxdigit((unsigned char)*at) || count == MOST_NUMBERS)
             return 0;
         numbers[count++] = strtoull(at, &end, base);
         if (end == at)
@@ -97,4 +99,19 @@ char *dem_crs_esri_text(const tl_crs *crs)
     if (context)
         proj_context_destroy(context);
     return copy;
+}
+
+int dem_crs_datum_code(const tl_crs *crs)
+{
+    PJ_CONTEXT *context = dem_proj_context();
+    PJ *object = context ? proj_create(context, crs->horizontal_wkt ? crs->horizontal_wkt : crs->wkt) : NULL;
+    PJ *datum = object ? proj_crs_get_datum_forced(context, object) : NULL;
+    const char *authority = datum ? proj_get_id_auth_name(datum, 0) : NULL;
+    const char *code = authority && strcmp(authority, "EPSG") == 0 ? proj_get_id_code(datum, 0) : NULL;
+    int number = code ? atoi(code) : 0;
+    proj_destroy(datum);
+    proj_destroy(object);
+    if (context)
+        proj_context_destroy(context);
+    return number;
 }

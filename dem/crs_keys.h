@@ -16,4 +16,7 @@ tl_status dem_crs_take_keys(tl_crs *crs, const char *text, const char *path, tl_
  * none. */
 char *dem_crs_esri_text(const tl_crs *crs);
 
+/* EPSG code of the datum of a CRS's horizontal part, 0 where it has none. */
+int dem_crs_datum_code(const tl_crs *crs);
+
 #endif

@@ -3,6 +3,7 @@
 
 #include "dem/crs_ellipsoidal.h"
 #include "dem/crs_map.h"
+#include "dem/crs_shift.h"
 #include "dem/geokeys.h"
 #include "dem/text.h"
 #include "lib/base/error.h"
@@ -171,8 +172,8 @@ static bool set_whole(PJ_CONTEXT *context, const PJ *whole, tl_crs *crs)
     return true;
 }
 
-/* The vertical part of `whole`, or its third axis, goes into a CRS that was made of its horizontal part; false when out
- * of memory. `altered`: the horizontal part has another unit now. */
+/* The vertical part of `whole`, or its third axis, or its datum shift, goes into a CRS that was made of its horizontal
+ * part; false when out of memory. `altered`: the horizontal part has another unit now. */
 static bool read_heights(PJ_CONTEXT *context, const PJ *whole, PJ *horizontal_crs, bool altered, tl_crs *crs)
 {
     PJ *vertical = vertical_part(context, whole);
@@ -191,7 +192,8 @@ static bool read_heights(PJ_CONTEXT *context, const PJ *whole, PJ *horizontal_cr
         crs->vertical_name = strdup(dem_ellipsoidal_name);
         crs->vertical_unit = unit_of_axis(context, whole, 2);
         good = crs->vertical_name && set_whole(context, whole, crs);
-    }
+    } else if (proj_get_type(whole) == PJ_TYPE_BOUND_CRS && !altered)
+        good = set_whole(context, whole, crs);
     if (!isfinite(crs->vertical_unit) || crs->vertical_unit < 0)
         crs->vertical_unit = 0;
     return good;
@@ -572,6 +574,8 @@ static PJ *crs_from_keys(PJ_CONTEXT *context, const dem_geokeys *keys)
         crs = from_definition(context, definition, keys);
         if (has_heights(keys))
             crs = with_heights(context, crs, keys);
+        else if (!is_code((uint16_t)definition->GCS)) /* EPSG knows better where a code is given */
+            crs = dem_crs_bind(context, crs, keys);
     }
     GTIFFreeDefn(definition);
     if (gtif)

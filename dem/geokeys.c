@@ -132,6 +132,14 @@ bool dem_geokeys_double(const dem_geokeys *keys, uint16_t key, double *value)
     return entry != NULL;
 }
 
+size_t dem_geokeys_doubles(const dem_geokeys *keys, uint16_t key, double *values, size_t room)
+{
+    const uint16_t *entry = find(keys, key, TAG_DOUBLES);
+    for (size_t k = 0; entry && k < entry[2] && k < room; k++)
+        values[k] = keys->doubles[entry[3] + k];
+    return entry ? entry[2] : 0;
+}
+
 char *dem_geokeys_text(const dem_geokeys *keys, uint16_t key)
 {
     const uint16_t *entry = find(keys, key, TAG_ASCII);

@@ -21,6 +21,8 @@ void dem_geokeys_finish(dem_geokeys *keys);
 /* Values of single keys; false, or NULL, where a key is not there as that type. */
 bool dem_geokeys_short(const dem_geokeys *keys, uint16_t key, uint16_t *value);
 bool dem_geokeys_double(const dem_geokeys *keys, uint16_t key, double *value);
+/* The numbers of a key, at most `room` of them; how many there are, 0 where the key is not there. */
+size_t dem_geokeys_doubles(const dem_geokeys *keys, uint16_t key, double *values, size_t room);
 /* A copy, without the bar that ends it; the caller frees it. */
 char *dem_geokeys_text(const dem_geokeys *keys, uint16_t key);
 

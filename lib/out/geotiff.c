@@ -151,11 +151,12 @@ static bool set_text(GTIF *keys, geokey_t key, const char *text)
     return GTIFKeySet(keys, key, TYPE_ASCII, 0, text) == 1;
 }
 
-/* Longitude and latitude without a code: the ellipsoid is what matters. */
+/* Longitude and latitude without a code: the datum where that has one, and the ellipsoid. */
 static bool set_ellipsoid(GTIF *keys, const tl_crs *crs)
 {
+    int datum = dem_crs_datum_code(crs);
     return set_short(keys, GeographicTypeGeoKey, KvUserDefined) && set_text(keys, GeogCitationGeoKey, crs->name) &&
-           set_short(keys, GeogGeodeticDatumGeoKey, KvUserDefined) &&
+           set_short(keys, GeogGeodeticDatumGeoKey, datum > 0 && datum < KvUserDefined ? datum : KvUserDefined) &&
            set_short(keys, GeogAngularUnitsGeoKey, Angular_Degree) &&
            set_short(keys, GeogEllipsoidGeoKey, KvUserDefined) &&
            set_double(keys, GeogSemiMajorAxisGeoKey, crs->semi_major) &&
