@@ -62,27 +62,6 @@ static tl_run phase_run(phase *self)
 
 /* ---- Reading ------------------------------------------------------------------------------------- */
 
-/* The magnitude as an integer of the same order, above those of all finite heights for voids. */
-static inline int32_t magnitude_bits(float z)
-{
-    int32_t bits;
-    memcpy(&bits, &z, sizeof bits);
-    return bits & INT32_MAX;
-}
-
-enum { FINITE_BITS = 0x7f7fffff };
-
-/* No surface passes an infinite height: a void as well. */
-static void clean(float *z, size_t count)
-{
-    int32_t most = 0;
-    for (size_t i = 0; i < count; i++)
-        most = magnitude_bits(z[i]) > most ? magnitude_bits(z[i]) : most;
-    for (size_t i = 0; most > FINITE_BITS && i < count; i++)
-        if (magnitude_bits(z[i]) > FINITE_BITS)
-            z[i] = NAN;
-}
-
 static tl_status read_band(void *context, tl_parallel *loop, uint64_t item, unsigned worker, tl_error *error)
 {
     builder *self = context;
@@ -93,7 +72,7 @@ static tl_status read_band(void *context, tl_parallel *loop, uint64_t item, unsi
     float *to = self->heights + y * self->width;
     tl_status status = tl_source_read(self->dem, self->framework->info.level, window, to, error);
     if (status == TL_OK)
-        clean(to, (size_t)(window.width * window.height));
+        tl_heights_clean(to, (size_t)(window.width * window.height));
     return status;
 }
 
@@ -165,75 +144,15 @@ static void load_block(const builder *self, tl_patch *patch, float *heights)
     patch->heights = heights + patch->stride + 1;
 }
 
-/* A constant c such that (z + c) - c == z only for multiples of a step that leaves double arithmetic exact. Weights of
- * a triangle of legs 2^log are integers up to 4^log, so heights up to m in steps of q are interpolated exactly while
- * m 4^log <= 2^53 q; slopes need three bits more for the same. */
-static double rounding_probe(float magnitude, int log)
-{
-    int exponent;
-    frexp((double)magnitude, &exponent);
-    return ldexp(1.5, 52 + exponent + 2 * log - 50);
-}
-
-static findings find_magnitude(const tl_patch *patch)
-{
-    int32_t most = 0, voids = 0;
-    for (int64_t y = 0; y <= patch->height; y++) {
-        const float *z = patch->heights + y * patch->stride;
-        for (int64_t x = 0; x <= patch->width; x++) {
-            int32_t bits = magnitude_bits(z[x]), is_void = bits > FINITE_BITS, finite = is_void ? 0 : bits;
-            voids |= is_void;
-            most = finite > most ? finite : most;
-        }
-    }
-    findings found = {.voids = voids};
-    memcpy(&found.magnitude, &most, sizeof most);
-    return found;
-}
-
-/* Whether a height of the patch is no multiple of the step behind a rounding probe. */
-static bool has_finer(const tl_patch *patch, double probe)
-{
-    int64_t finer = 0;
-    for (int64_t y = 0; y <= patch->height; y++) {
-        const float *z = patch->heights + y * patch->stride;
-        for (int64_t x = 0; x <= patch->width; x++)
-            finer |= fabs((double)z[x] + probe - probe - (double)z[x]) > 0; /* false for a void */
-    }
-    return finer;
-}
-
 /* Looks at a block's heights; *own_rounding becomes the rounding error within the block, 0 where there is none. */
 static findings inspect_block(const tl_patch *patch, double *own_rounding, int block_log, int lattice_log)
 {
-    findings found = find_magnitude(patch);
-    found.rounds = has_finer(patch, rounding_probe(found.magnitude, lattice_log));
-    bool rounds = found.rounds && has_finer(patch, rounding_probe(found.magnitude, block_log));
+    tl_heights of = {patch->heights, patch->stride, patch->width + 1, patch->height + 1};
+    findings found = {.magnitude = tl_heights_magnitude(&of, &found.voids)};
+    found.rounds = tl_heights_round(&of, found.magnitude, lattice_log);
+    bool rounds = found.rounds && tl_heights_round(&of, found.magnitude, block_log);
     *own_rounding = rounds ? tl_plane_rounding((double)found.magnitude) : 0;
     return found;
-}
-
-/* Eight bytes of 0 or 1 to as many bits, the first the lowest: the factor moves byte k by 56 - 7 k bits, so that all
- * meet in the highest byte. */
-static inline uint64_t pack8(const unsigned char *bytes)
-{
-    uint64_t eight;
-    memcpy(&eight, bytes, sizeof eight);
-#if __BYTE_ORDER__ == __ORDER_BIG_ENDIAN__
-    eight = __builtin_bswap64(eight);
-#endif
-    return eight * UINT64_C(0x0102040810204080) >> 56;
-}
-
-static uint64_t pack(const unsigned char *bytes, int64_t count)
-{
-    uint64_t bits = 0;
-    int64_t i = 0;
-    for (; i + 8 <= count; i += 8)
-        bits |= pack8(bytes + i) << i;
-    for (; i < count; i++)
-        bits |= (uint64_t)bytes[i] << i;
-    return bits;
 }
 
 /* Stores the marks: the block's own samples in the bitmap, its right column and bottom row, which belong to the next
@@ -248,7 +167,7 @@ static void store_block(const builder *self, const tl_patch *patch, uint64_t blo
         uint64_t *to = framework->split + (size_t)(patch->y + y) * framework->words + (patch->x >> 6);
         const unsigned char *from = patch->split + y * patch->split_stride;
         for (int64_t x = 0; x < columns; x += 64)
-            to[x >> 6] = pack(from + x, tl_int64_min(64, columns - x));
+            to[x >> 6] = tl_pack_bits(from + x, tl_int64_min(64, columns - x));
     }
     for (int64_t i = 0; i <= side; i++) {
         right[i] = patch->rim_x >= side && i <= patch->rim_y ? patch->split[i * patch->split_stride + side] : 0;
@@ -333,8 +252,7 @@ static tl_status run_block(void *context, tl_parallel *loop, uint64_t item, unsi
 
 /* ---- Merging across the blocks' borders ------------------------------------------------------------ */
 
-/* The vertices whose triangles must be split so that (x, y) can split its own: the right angles of these. */
-static void parents(int64_t x, int64_t y, int64_t out[2][2])
+void tl_lattice_parents(int64_t x, int64_t y, int64_t out[2][2])
 {
     int64_t s = (x | y) & -(x | y);
     if ((x & s) && (y & s)) {
@@ -361,7 +279,7 @@ static void force_parents(builder *self, int64_t x, int64_t y)
     while (depth) {
         depth--;
         int64_t up[2][2];
-        parents(stack[depth][0], stack[depth][1], up);
+        tl_lattice_parents(stack[depth][0], stack[depth][1], up);
         for (int i = 0; i < 2; i++) {
             int64_t px = up[i][0], py = up[i][1];
             if (px < 0 || py < 0 || px >= self->width || py >= self->height || !((px | py) & top_mask) ||
@@ -577,7 +495,8 @@ static tl_status build(builder *self, const tl_run *run, tl_error *error)
             status = run_top(self, &run_rest, error);
     }
     framework->voids = self->all.voids || flat;
-    return status == TL_OK ? tl_framework_find_points(framework, self->heights, &run_rest, error) : status;
+    const tl_rows rows = {.all = self->heights};
+    return status == TL_OK ? tl_framework_find_points(framework, &rows, &run_rest, error) : status;
 }
 
 /* A copy of the DEM's description that outlives it. */
@@ -619,24 +538,31 @@ static tl_status check(const tl_source_info *info, double max_error, tl_error *e
     return TL_OK;
 }
 
-tl_framework *tl_framework_build(const tl_source *dem, const tl_framework_options *options, tl_error *error)
+tl_framework *tl_framework_create(const tl_source_info *info, double max_error, const tl_run *run, tl_error *error)
 {
-    if (check(&dem->info, options->max_error, error) != TL_OK)
+    if (check(info, max_error, error) != TL_OK)
         return NULL;
     tl_framework *framework = calloc(1, sizeof *framework);
     if (!framework) {
         tl_fail_memory(error, "the framework");
         return NULL;
     }
-    framework->max_error = options->max_error;
+    framework->max_error = max_error;
+    framework->threads = run ? run->threads : 0;
+    if (copy_info(framework, info, error) == TL_OK && lay_out(framework, error) == TL_OK)
+        return framework;
+    tl_framework_destroy(framework);
+    return NULL;
+}
+
+tl_framework *tl_framework_build(const tl_source *dem, const tl_framework_options *options, tl_error *error)
+{
+    tl_framework *framework = tl_framework_create(&dem->info, options->max_error, options->run, error);
+    if (!framework)
+        return NULL;
     framework->bends = dem_frame_bends(&dem->info.georef, options->frame);
-    framework->threads = options->run ? options->run->threads : 0;
     builder self = {.framework = framework, .dem = dem, .width = dem->info.width, .height = dem->info.height};
-    tl_status status = copy_info(framework, &dem->info, error);
-    if (status == TL_OK)
-        status = lay_out(framework, error);
-    if (status == TL_OK)
-        status = build(&self, options->run, error);
+    tl_status status = build(&self, options->run, error);
     free(self.heights);
     free(self.found);
     free(self.borders);

@@ -15,6 +15,8 @@
 
 #include "lib/talus.h"
 
+#include <string.h>
+
 enum { TL_BLOCK_LOG = 8, TL_BLOCK = 1 << TL_BLOCK_LOG };
 
 /* A triangle that ties in a sample which no cell draws: see framework_ties.c. */
@@ -32,6 +34,7 @@ struct tl_framework {
     bool voids;    /* the raster may have void samples, or has no cells at all */
     int64_t columns, rows;    /* of blocks */
     size_t words;             /* of 64 samples in a row of the two bitmaps */
+    uint64_t valid_count;     /* samples that are not void */
     uint64_t *split, *points; /* vertices that split triangles; corners of triangles that are drawn */
     uint32_t *rank;           /* [row][block column]: number of points before */
     float *heights;           /* of the points, row by row */
@@ -62,9 +65,60 @@ static inline int tl_size_of(int64_t s, bool centre)
 tl_status tl_framework_rises(const float *heights, int64_t width, int64_t height, int lattice_log, const tl_run *run,
                              double rises[TL_SIZES], tl_error *error);
 
-/* Fills in `points`, their number, rank and heights, and the number of isolated samples, from `split` and the DEM's
- * heights (width * height, NaN for voids). */
-tl_status tl_framework_find_points(tl_framework *framework, const float *dem, const tl_run *run, tl_error *error);
+/* A framework without marks over a raster like this; refuses bounds and sizes that cannot be. */
+tl_framework *tl_framework_create(const tl_source_info *info, double max_error, const tl_run *run, tl_error *error);
+
+/* Rows of a DEM: an array of them all (NaN for voids), or a source to read. */
+typedef struct tl_rows {
+    const float *all;
+    const tl_source *source; /* where `all` is NULL */
+} tl_rows;
+
+/* Fills in `points`, their number, rank and heights, ties and the number of isolated samples, from `split` and the
+ * DEM's heights. */
+tl_status tl_framework_find_points(tl_framework *framework, const tl_rows *dem, const tl_run *run, tl_error *error);
+
+/* Number of triangles of the mesh. */
+tl_status tl_framework_count_triangles(const tl_framework *framework, size_t *count, tl_error *error);
+
+/* A rectangle of heights. */
+typedef struct tl_heights {
+    const float *z;
+    int64_t stride, width, height;
+} tl_heights;
+
+/* Makes infinite heights voids: no surface passes them. */
+void tl_heights_clean(float *z, size_t count);
+/* The largest |height|; *voids becomes whether there are voids. */
+float tl_heights_magnitude(const tl_heights *of, bool *voids);
+/* Whether interpolation in triangles of legs up to 2^log rounds in double arithmetic, of heights up to `magnitude`. */
+bool tl_heights_round(const tl_heights *of, float magnitude, int log);
+
+/* The vertices whose triangles must be split so that (x, y) can split its own: the right angles of these. */
+void tl_lattice_parents(int64_t x, int64_t y, int64_t out[2][2]);
+
+/* Eight bytes of 0 or 1 to as many bits, the first the lowest: the factor moves byte k by 56 - 7 k bits, so that all
+ * meet in the highest byte. */
+static inline uint64_t tl_pack8(const unsigned char *bytes)
+{
+    uint64_t eight;
+    memcpy(&eight, bytes, sizeof eight);
+#if __BYTE_ORDER__ == __ORDER_BIG_ENDIAN__
+    eight = __builtin_bswap64(eight);
+#endif
+    return eight * UINT64_C(0x0102040810204080) >> 56;
+}
+
+static inline uint64_t tl_pack_bits(const unsigned char *bytes, int64_t count)
+{
+    uint64_t bits = 0;
+    int64_t i = 0;
+    for (; i + 8 <= count; i += 8)
+        bits |= tl_pack8(bytes + i) << i;
+    for (; i < count; i++)
+        bits |= (uint64_t)bytes[i] << i;
+    return bits;
+}
 
 /* Finds the ties of the valid samples that are not `joined`: bitmaps like those of the framework. Marks the samples of
  * the ties as joined and as points. */

@@ -23,21 +23,40 @@ static const uint32_t NO_POINT = UINT32_MAX;
  * samples and is not mixed. This is decided from the eight neighbours alone, 64 samples at a time. */
 typedef struct finder {
     tl_framework *framework;
-    const float *dem;
+    const tl_rows *dem;
+    float **rows;             /* by worker: a band that was read */
     uint64_t *valid, *joined; /* bitmaps; NULL where there are no voids. Joined: in some triangle */
     size_t *counts;           /* points by row */
 } finder;
+
+/* Rows y ... end - 1, in *out. */
+static tl_status read_band(const finder *self, int64_t y, int64_t end, unsigned worker, const float **out,
+                           tl_error *error)
+{
+    const tl_source_info *info = &self->framework->info;
+    if (self->dem->all) {
+        *out = self->dem->all + y * info->width;
+        return TL_OK;
+    }
+    tl_window window = {0, y, info->width, end - y};
+    tl_status status = tl_source_read(self->dem->source, info->level, window, self->rows[worker], error);
+    if (status == TL_OK)
+        tl_heights_clean(self->rows[worker], (size_t)(window.width * window.height));
+    *out = self->rows[worker];
+    return status;
+}
 
 static tl_status find_valid_band(void *context, tl_parallel *loop, uint64_t item, unsigned worker, tl_error *error)
 {
     const finder *self = context;
     const tl_source_info *info = &self->framework->info;
     (void)loop;
-    (void)worker;
-    (void)error;
     int64_t y = (int64_t)item * BAND, end = tl_int64_min(y + BAND, info->height);
-    for (; y < end; y++) {
-        const float *z = self->dem + y * info->width;
+    const float *z;
+    tl_status status = read_band(self, y, end, worker, &z, error);
+    if (status != TL_OK)
+        return status;
+    for (; y < end; y++, z += info->width) {
         uint64_t *out = self->valid + (size_t)y * self->framework->words;
         for (int64_t x = 0; x < info->width; x++)
             out[x >> 6] |= (uint64_t)!isnan(z[x]) << (x & 63);
@@ -126,6 +145,7 @@ static tl_status tie_alone(finder *self, tl_error *error)
 {
     tl_framework *framework = self->framework;
     size_t words = framework->words * (size_t)framework->info.height, valid = count_bits(self->valid, words);
+    framework->valid_count = valid;
     if (count_bits(self->joined, words) == valid)
         return TL_OK;
     tl_status status = tl_framework_tie(framework, self->valid, self->joined, error);
@@ -139,12 +159,13 @@ static tl_status collect_band(void *context, tl_parallel *loop, uint64_t item, u
     const finder *self = context;
     tl_framework *framework = self->framework;
     (void)loop;
-    (void)worker;
-    (void)error;
     int64_t columns = tl_div_up(framework->info.width, TL_BLOCK);
     int64_t y = (int64_t)item * BAND, end = tl_int64_min(y + BAND, framework->info.height);
-    for (; y < end; y++) {
-        const float *z = self->dem + y * framework->info.width;
+    const float *z;
+    tl_status status = read_band(self, y, end, worker, &z, error);
+    if (status != TL_OK)
+        return status;
+    for (; y < end; y++, z += framework->info.width) {
         size_t next = self->counts[y];
         for (size_t w = 0; w < framework->words; w++) {
             if (w % (TL_BLOCK / 64) == 0)
@@ -195,17 +216,34 @@ static tl_status find_points(finder *self, const tl_run *run, tl_error *error)
     return tl_parallel_for(run, bands, 0, collect_band, self, error);
 }
 
-tl_status tl_framework_find_points(tl_framework *framework, const float *dem, const tl_run *run, tl_error *error)
+static bool make_finder(finder *self, unsigned workers)
+{
+    const tl_framework *framework = self->framework;
+    size_t words = framework->words * (size_t)framework->info.height; /* as many as the bitmaps of the framework */
+    self->counts = tl_alloc((size_t)framework->info.height, sizeof *self->counts);
+    self->rows = calloc(workers, sizeof *self->rows);
+    for (unsigned i = 0; self->rows && !self->dem->all && i < workers; i++) {
+        self->rows[i] = tl_alloc_grid(framework->info.width, BAND, sizeof **self->rows);
+        if (!self->rows[i])
+            return false;
+    }
+    if (framework->voids) {
+        self->valid = calloc(words, sizeof *self->valid);
+        self->joined = calloc(words, sizeof *self->joined);
+    }
+    return self->counts && self->rows && (!framework->voids || (self->valid && self->joined));
+}
+
+tl_status tl_framework_find_points(tl_framework *framework, const tl_rows *dem, const tl_run *run, tl_error *error)
 {
     finder self = {.framework = framework, .dem = dem};
-    size_t words = framework->words * (size_t)framework->info.height; /* as many as the bitmaps of the framework */
-    self.counts = tl_alloc((size_t)framework->info.height, sizeof *self.counts);
-    if (framework->voids) {
-        self.valid = calloc(words, sizeof *self.valid);
-        self.joined = calloc(words, sizeof *self.joined);
-    }
-    bool ready = self.counts && (!framework->voids || (self.valid && self.joined));
-    tl_status status = ready ? find_points(&self, run, error) : tl_fail_memory(error, "the framework");
+    unsigned workers = tl_parallel_workers(run, (uint64_t)tl_div_up(framework->info.height, BAND));
+    framework->valid_count = (uint64_t)framework->info.width * (uint64_t)framework->info.height;
+    tl_status status =
+        make_finder(&self, workers) ? find_points(&self, run, error) : tl_fail_memory(error, "the framework");
+    for (unsigned i = 0; self.rows && i < workers; i++)
+        free(self.rows[i]);
+    free(self.rows);
     free(self.valid);
     free(self.joined);
     free(self.counts);
@@ -497,16 +535,26 @@ static tl_status describe(const tl_framework *framework, tl_mesh *mesh, tl_error
     return status == TL_OK ? tl_mesh_add_parameter(mesh, "mesh", "quadtree", error) : status;
 }
 
-static tl_status draw_all(drawing *self, const tl_run *run, tl_mesh **out, tl_error *error)
+/* Counts all triangles but the ties, and turns the blocks' counts into sums of those before. */
+static tl_status count_all(drawing *self, const tl_run *run, size_t *count, tl_error *error)
 {
     const tl_framework *framework = self->framework;
     size_t blocks = (size_t)(framework->columns * framework->rows), sum = draw_whole_top(framework, NULL);
     tl_status status = tl_parallel_for(run, blocks, 0, draw_item, self, error);
     for (size_t i = 0; i < blocks; i++) {
-        size_t count = self->counts[i];
+        size_t own = self->counts[i];
         self->counts[i] = sum;
-        sum += count;
+        sum += own;
     }
+    *count = sum;
+    return status;
+}
+
+static tl_status draw_all(drawing *self, const tl_run *run, tl_mesh **out, tl_error *error)
+{
+    const tl_framework *framework = self->framework;
+    size_t sum;
+    tl_status status = count_all(self, run, &sum, error);
     size_t all = sum + framework->tie_count;
     tl_mesh *mesh = status == TL_OK ? tl_mesh_create(framework->point_count, all, &framework->info, error) : NULL;
     if (!mesh)
@@ -515,7 +563,7 @@ static tl_status draw_all(drawing *self, const tl_run *run, tl_mesh **out, tl_er
     draw_whole_top(framework, mesh->indices);
     draw_ties(framework, mesh->indices + 3 * sum);
     self->indices = mesh->indices;
-    status = tl_parallel_for(run, blocks, 0, draw_item, self, error);
+    status = tl_parallel_for(run, (uint64_t)(framework->columns * framework->rows), 0, draw_item, self, error);
     if (status == TL_OK)
         status = describe(framework, mesh, error);
     if (status == TL_OK)
@@ -538,20 +586,36 @@ static bool make_blocks(drawing *self, unsigned workers)
     return self->blocks;
 }
 
-tl_status tl_framework_mesh(const tl_framework *framework, tl_mesh **out, tl_error *error)
+/* Draws the mesh, or only counts its triangles where out is NULL. */
+static tl_status draw_or_count(const tl_framework *framework, tl_mesh **out, size_t *count, tl_error *error)
 {
     drawing self = {.framework = framework};
     tl_run run = {.threads = framework->threads};
     size_t blocks = (size_t)(framework->columns * framework->rows);
     unsigned workers = tl_parallel_workers(&run, blocks);
     self.counts = tl_alloc(blocks, sizeof *self.counts);
-    bool ready = self.counts && make_blocks(&self, workers);
-    tl_status status = ready ? draw_all(&self, &run, out, error) : tl_fail_memory(error, "the mesh");
+    tl_status status = TL_OK;
+    if (!self.counts || !make_blocks(&self, workers))
+        status = tl_fail_memory(error, "the mesh");
+    else
+        status = out ? draw_all(&self, &run, out, error) : count_all(&self, &run, count, error);
     for (unsigned i = 0; self.blocks && i < workers; i++) {
         free(self.blocks[i].split);
         free(self.blocks[i].index);
     }
     free(self.blocks);
     free(self.counts);
+    return status;
+}
+
+tl_status tl_framework_mesh(const tl_framework *framework, tl_mesh **out, tl_error *error)
+{
+    return draw_or_count(framework, out, NULL, error);
+}
+
+tl_status tl_framework_count_triangles(const tl_framework *framework, size_t *count, tl_error *error)
+{
+    tl_status status = draw_or_count(framework, NULL, count, error);
+    *count += framework->tie_count;
     return status;
 }
