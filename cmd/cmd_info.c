@@ -11,7 +11,6 @@ enum { MEMORY = 64 }; /* megabytes */
 typedef struct settings {
     common common;
     bool json;
-    const char *window; /* X,Y,W,H */
 } settings;
 
 enum { MAX_OVERVIEWS = 64 };
@@ -32,7 +31,8 @@ typedef struct facts {
     double corner_lon[4], corner_lat[4]; /* from the first of the first row clockwise */
     bool has_window;
     tl_window window;
-    tl_dem_cost cost; /* of the window */
+    tl_dem_cost cost; /* of the window, where it can be told */
+    bool has_cost;
 } facts;
 
 /* CRS coordinates of the footprint: cells for area rasters, samples for points. */
@@ -154,10 +154,13 @@ static json_t *file_json(const facts *f)
 static json_t *window_json(const facts *f)
 {
     const tl_window *w = &f->window;
-    return json_pack("{s:I, s:I, s:I, s:I, s:I, s:I, s:I}", "x", (json_int_t)w->x, "y", (json_int_t)w->y, "width",
-                     (json_int_t)w->width, "height", (json_int_t)w->height, "blocks", (json_int_t)f->cost.blocks,
-                     "stored_bytes", (json_int_t)f->cost.stored_bytes, "decoded_bytes",
-                     (json_int_t)f->cost.decoded_bytes);
+    json_t *object = json_pack("{s:I, s:I, s:I, s:I}", "x", (json_int_t)w->x, "y", (json_int_t)w->y, "width",
+                               (json_int_t)w->width, "height", (json_int_t)w->height);
+    if (f->has_cost)
+        json_object_update_new(object, json_pack("{s:I, s:I, s:I}", "blocks", (json_int_t)f->cost.blocks,
+                                                 "stored_bytes", (json_int_t)f->cost.stored_bytes, "decoded_bytes",
+                                                 (json_int_t)f->cost.decoded_bytes));
+    return object;
 }
 
 /* The files of a mosaic; of nothing else, for one file is told of in full. */
@@ -341,7 +344,7 @@ static void print_text(const facts *f)
     if (f->roughness.measurable)
         printf("roughness    sigma %.4g over the finest octave, exponent %.3g\n", f->roughness.sigma,
                f->roughness.hurst);
-    if (f->has_window)
+    if (f->has_cost)
         printf("window       %llu blocks, %llu bytes in the file, %llu decoded\n", (unsigned long long)f->cost.blocks,
                (unsigned long long)f->cost.stored_bytes, (unsigned long long)f->cost.decoded_bytes);
     for (size_t i = 0; i < info->parameter_count; i++)
@@ -349,30 +352,16 @@ static void print_text(const facts *f)
                info->parameters[i].value);
 }
 
-/* The window that --window names; false, told, where it is none of this raster. */
-static bool parse_window(const char *text, const tl_source_info *info, tl_window *out)
-{
-    long long x, y, width, height;
-    char more;
-    if (sscanf(text, "%lld,%lld,%lld,%lld%c", &x, &y, &width, &height, &more) == 4 && x >= 0 && y >= 0 && width >= 1 &&
-        height >= 1 && x < info->width && y < info->height && width <= info->width - x && height <= info->height - y) {
-        *out = (tl_window){x, y, width, height};
-        return true;
-    }
-    complain("--window %s: is no X,Y,WIDTH,HEIGHT inside of %lld x %lld samples", text, (long long)info->width,
-             (long long)info->height);
-    return false;
-}
-
 /* All that is known without reading samples. */
-static tl_status look(facts *f, tl_error *error)
+static void look(facts *f)
 {
     f->has_details = tl_dem_get_details(f->source, &f->details, NULL) == TL_OK;
     f->has_bounds = tl_source_bounds(f->info, f->bounds, NULL) == TL_OK;
     find_corners(f);
     if (f->has_details)
         tl_dem_get_overviews(f->source, f->overviews, MAX_OVERVIEWS, &f->overview_count, NULL);
-    return f->has_window ? tl_dem_get_cost(f->source, f->window, &f->cost, error) : TL_OK;
+    f->has_cost = f->has_window && f->window.x + f->window.width <= f->source->info.width &&
+                  tl_dem_get_cost(f->source, f->window, &f->cost, NULL) == TL_OK;
 }
 
 static int inform(const settings *set, const arguments *inputs)
@@ -385,15 +374,12 @@ static int inform(const settings *set, const arguments *inputs)
     if (!source)
         return command_failed(&bar, &error);
     facts f = {.info = &source->info, .source = opened.file};
-    f.has_window = set->window != NULL;
-    if (set->window && !parse_window(set->window, f.info, &f.window)) {
-        progress_end(&bar);
-        command_close(&opened);
-        return EXIT_USAGE;
-    }
+    f.has_window = set->common.window_given || set->common.box_given;
+    f.window = opened.window;
     int status = EXIT_DONE;
     progress_stage(&bar, "reading");
-    if (look(&f, &error) != TL_OK || tl_source_range(source, &run, &f.range, &error) != TL_OK ||
+    look(&f);
+    if (tl_source_range(source, &run, &f.range, &error) != TL_OK ||
         tl_source_suspects(source, &run, f.suspects, &f.suspect_count, &error) != TL_OK ||
         tl_roughness_measure(source, &run, &f.roughness, &error) != TL_OK)
         status = command_failed(&bar, &error);
@@ -410,10 +396,7 @@ static int run(const command *self, int argc, const char **argv, bool help)
 {
     settings set = {0};
     const option output[] = {
-        {"json", 'j', OPTION_FLAG, &set.json, NULL, NULL, "for machines: one JSON object", 0, 0, NULL},
-        {"window", 0, OPTION_TEXT, &set.window, NULL, "X,Y,W,H",
-         "also tell what reading this window of one file takes: first column and row, size", 0, 0, NULL},
-        {0}};
+        {"json", 'j', OPTION_FLAG, &set.json, NULL, NULL, "for machines: one JSON object", 0, 0, NULL}, {0}};
     const option input[] = {COMMON_INPUT(set.common), {0}};
     const option running[] = {COMMON_RUNNING(set.common), {0}};
     const option_group groups[] = {{"Output", output}, {"Input", input}, {"Running", running}, {0}};
@@ -428,5 +411,5 @@ static int run(const command *self, int argc, const char **argv, bool help)
     return status;
 }
 
-const command command_info = {"info", "tell what a raster holds", "RASTER... [--json] [--window X,Y,W,H]",
+const command command_info = {"info", "tell what a raster holds", "RASTER... [--json]",
                               INPUT_NOTES "\n\nWithout --memory, info takes 64 MB.", run};

@@ -109,6 +109,29 @@ static void put_over(opened_input *opened, tl_source *made)
     opened->source = made;
 }
 
+/* The part of the file that is asked for. */
+static tl_status choose_window(const common *options, const tl_source_info *info, tl_window *out, tl_error *error)
+{
+    const int64_t *w = options->window;
+    if (options->window_given && options->box_given) {
+        error->status = TL_ERROR_ARGUMENT;
+        snprintf(error->text, sizeof error->text, "--window and --bbox name two parts; give one of them");
+        return error->status;
+    }
+    *out = options->window_given ? (tl_window){w[0], w[1], w[2], w[3]} : (tl_window){0, 0, info->width, info->height};
+    return options->box_given ? tl_cut_of_box(info, options->box, out, error) : TL_OK;
+}
+
+static void cut(const common *options, opened_input *opened, tl_error *error)
+{
+    if (!opened->source)
+        return;
+    if (choose_window(options, &opened->source->info, &opened->window, error) != TL_OK)
+        put_over(opened, NULL);
+    else if (options->window_given || options->box_given)
+        put_over(opened, tl_cut_create(opened->source, opened->window, error));
+}
+
 opened_input command_open(const common *options, const arguments *inputs, const tl_run *run, tl_error *error)
 {
     /* opening has no progress to speak of */
@@ -119,6 +142,7 @@ opened_input command_open(const common *options, const arguments *inputs, const 
     if (void_options(options, run, &voids, error))
         put_over(&opened, open_files(options, inputs, &quietly, error));
     opened.file = opened.source;
+    cut(options, &opened, error);
     /* a height that is given to voids counts from where the file's heights do */
     if (opened.source && (voids.rule != TL_VOIDS_KEEP || voids.nodata_given))
         put_over(&opened, tl_voids_create(opened.source, &voids, error));

@@ -25,6 +25,9 @@ typedef struct common {
     bool overwrite, quiet, feather;
     const char *voids; /* keep, fill or a number */
     const char *geoid; /* none, egm96 or a file */
+    int64_t window[4]; /* first column and row, columns, rows */
+    double box[4];     /* west, south, east, north */
+    bool window_given, box_given;
     double nodata;
     bool nodata_given;
     int64_t band; /* 0: the first */
@@ -34,43 +37,72 @@ typedef struct common {
 } common;
 
 /* The rows of the options in a `common`, for use inside of an array of options. */
-#define COMMON_INPUT(c)                                                                                               \
-    {"band", 0,   OPTION_INTEGER, &(c).band, NULL, "N", "the band that holds the heights, 1...65535 (default: 1)", 1, \
-     65535,  NULL},                                                                                                   \
-        {"nodata",                                                                                                    \
-         0,                                                                                                           \
-         OPTION_NUMBER,                                                                                               \
-         &(c).nodata,                                                                                                 \
-         &(c).nodata_given,                                                                                           \
-         "VALUE",                                                                                                     \
-         "a height that stands for void, besides what the file declares",                                             \
-         -3.5e38,                                                                                                     \
-         3.5e38,                                                                                                      \
-         NULL},                                                                                                       \
-        {"voids",                                                                                                     \
-         0,                                                                                                           \
-         OPTION_TEXT,                                                                                                 \
-         &(c).voids,                                                                                                  \
-         NULL,                                                                                                        \
-         "RULE",                                                                                                      \
-         "keep; fill, by a smooth surface from the rim; or a height for all (default: keep)",                         \
-         0,                                                                                                           \
-         0,                                                                                                           \
-         NULL},                                                                                                       \
-        {"geoid",                                                                                                     \
-         0,                                                                                                           \
-         OPTION_TEXT,                                                                                                 \
-         &(c).geoid,                                                                                                  \
-         NULL,                                                                                                        \
-         "GEOID",                                                                                                     \
-         "what heights count from, to make them ellipsoidal: none, egm96 or a grid FILE (default: none)",             \
-         0,                                                                                                           \
-         0,                                                                                                           \
-         NULL},                                                                                                       \
-    {                                                                                                                 \
-        "feather", 0, OPTION_FLAG, &(c).feather, NULL, NULL,                                                          \
-            "blend files where they overlap, over at most 32 samples (default: the finest, then the first)", 0, 0,    \
-            NULL                                                                                                      \
+#define COMMON_INPUT(c)                                                                                            \
+    {"window",                                                                                                     \
+     0,                                                                                                            \
+     OPTION_WINDOW,                                                                                                \
+     (c).window,                                                                                                   \
+     &(c).window_given,                                                                                            \
+     "X,Y,W,H",                                                                                                    \
+     "only this part: first column and row, from 0, columns and rows",                                             \
+     0,                                                                                                            \
+     0,                                                                                                            \
+     NULL},                                                                                                        \
+        {"bbox",                                                                                                   \
+         0,                                                                                                        \
+         OPTION_BOX,                                                                                               \
+         (c).box,                                                                                                  \
+         &(c).box_given,                                                                                           \
+         "W,S,E,N",                                                                                                \
+         "only the samples in this box of CRS coordinates (longitude, latitude where geographic)",                 \
+         0,                                                                                                        \
+         0,                                                                                                        \
+         NULL},                                                                                                    \
+                                                                                                                   \
+        {"band",                                                                                                   \
+         0,                                                                                                        \
+         OPTION_INTEGER,                                                                                           \
+         &(c).band,                                                                                                \
+         NULL,                                                                                                     \
+         "N",                                                                                                      \
+         "the band that holds the heights, 1...65535 (default: 1)",                                                \
+         1,                                                                                                        \
+         65535,                                                                                                    \
+         NULL},                                                                                                    \
+        {"nodata",                                                                                                 \
+         0,                                                                                                        \
+         OPTION_NUMBER,                                                                                            \
+         &(c).nodata,                                                                                              \
+         &(c).nodata_given,                                                                                        \
+         "VALUE",                                                                                                  \
+         "a height that stands for void, besides what the file declares",                                          \
+         -3.5e38,                                                                                                  \
+         3.5e38,                                                                                                   \
+         NULL},                                                                                                    \
+        {"voids",                                                                                                  \
+         0,                                                                                                        \
+         OPTION_TEXT,                                                                                              \
+         &(c).voids,                                                                                               \
+         NULL,                                                                                                     \
+         "RULE",                                                                                                   \
+         "keep; fill, by a smooth surface from the rim; or a height for all (default: keep)",                      \
+         0,                                                                                                        \
+         0,                                                                                                        \
+         NULL},                                                                                                    \
+        {"geoid",                                                                                                  \
+         0,                                                                                                        \
+         OPTION_TEXT,                                                                                              \
+         &(c).geoid,                                                                                               \
+         NULL,                                                                                                     \
+         "GEOID",                                                                                                  \
+         "what heights count from, to make them ellipsoidal: none, egm96 or a grid FILE (default: none)",          \
+         0,                                                                                                        \
+         0,                                                                                                        \
+         NULL},                                                                                                    \
+    {                                                                                                              \
+        "feather", 0, OPTION_FLAG, &(c).feather, NULL, NULL,                                                       \
+            "blend files where they overlap, over at most 32 samples (default: the finest, then the first)", 0, 0, \
+            NULL                                                                                                   \
     }
 #define COMMON_OUTPUT(c)                                                                                       \
     {"output", 'o', OPTION_TEXT, &(c).output, NULL, "FILE", "where to write; the ending chooses the format",   \
@@ -118,6 +150,7 @@ tl_run command_run(const common *options, progress *bar);
 typedef struct opened_input {
     tl_source *source; /* to be used; NULL: could not be opened */
     tl_source *file;   /* as it is */
+    tl_window window;  /* the part of it that is used */
     tl_source *steps[OPENED_STEPS];
     int step_count;
 } opened_input;

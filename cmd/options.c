@@ -113,14 +113,34 @@ static bool integer_value(const option *o, const char *text)
     return true;
 }
 
-static bool triple_value(const option *o, const char *text)
+static bool numbers_value(const option *o, const char *text, int count)
 {
-    double values[3];
+    double values[4];
     const char *at = text;
-    for (int k = 0; k < 3; k++) {
+    for (int k = 0; k < count; k++) {
         char *end;
-        if (!parse_double(at, &end, &values[k]) || *end != (k < 2 ? ',' : '\0')) {
-            complain("--%s: three numbers %s are wanted, not '%s'", o->name, o->argument, text);
+        if (!parse_double(at, &end, &values[k]) || *end != (k < count - 1 ? ',' : '\0')) {
+            complain("--%s: %s numbers %s are wanted, not '%s'", o->name, count == 3 ? "three" : "four", o->argument,
+                     text);
+            return false;
+        }
+        at = end + 1;
+    }
+    memcpy(o->target, values, (size_t)count * sizeof *values);
+    return true;
+}
+
+static bool window_value(const option *o, const char *text)
+{
+    int64_t values[4];
+    const char *at = text;
+    for (int k = 0; k < 4; k++) {
+        char *end;
+        errno = 0;
+        values[k] = strtoll(at, &end, 10);
+        if (end == at || errno == ERANGE || values[k] < k / 2 || *end != (k < 3 ? ',' : '\0')) {
+            complain("--%s: %s is wanted, whole numbers, columns and rows counted from 0, not '%s'", o->name,
+                     o->argument, text);
             return false;
         }
         at = end + 1;
@@ -154,7 +174,11 @@ static bool take_value(const option *o, const char *text)
     case OPTION_NUMBER:
         return number_value(o, text);
     case OPTION_TRIPLE:
-        return triple_value(o, text);
+        return numbers_value(o, text, 3);
+    case OPTION_BOX:
+        return numbers_value(o, text, 4);
+    case OPTION_WINDOW:
+        return window_value(o, text);
     case OPTION_CHOICE:
         return choice_value(o, text);
     case OPTION_TEXT:

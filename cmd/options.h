@@ -13,6 +13,8 @@ typedef enum option_kind {
     OPTION_INTEGER, /* int64_t */
     OPTION_NUMBER,  /* double */
     OPTION_TRIPLE,  /* double[3]: A,B,C */
+    OPTION_BOX,     /* double[4]: A,B,C,D */
+    OPTION_WINDOW,  /* int64_t[4]: column and row, from 0, and columns and rows, from 1 */
     OPTION_TEXT,    /* const char * */
     OPTION_CHOICE,  /* int: index into `choices` */
 } option_kind;

@@ -234,6 +234,16 @@ TL_API size_t tl_dem_member_count(const tl_source *dem);
 /* Files in the order in which they were given. */
 TL_API tl_status tl_dem_get_member(const tl_source *dem, size_t index, tl_dem_member *out, tl_error *error);
 
+/* A part of a source as a source, as if there were no more: its own first sample is the window's. The window lies in
+ * the finest level; on a raster that wraps it may go on behind the last column with the first one. Coarser levels are
+ * held where the part's cells of that level are the source's own. TL_ERROR_ARGUMENT where the window does not lie in
+ * it. */
+TL_API tl_source *tl_cut_create(const tl_source *source, tl_window window, tl_error *error);
+/* The window of the samples (of area rasters: cells' centres) in a box of CRS coordinates, west, south, east, north, or
+ * the lowest and highest x and y; cut at the raster's rim. In longitude and latitude a box with its east below its west
+ * crosses the antimeridian, and whole turns do not count. TL_ERROR_ARGUMENT where there are none. */
+TL_API tl_status tl_cut_of_box(const tl_source_info *info, const double box[4], tl_window *out, tl_error *error);
+
 /* What a file says of itself; strings live as long as the source. */
 typedef struct tl_dem_details {
     const char *sample_type; /* "int16", "float32", ... */

@@ -485,8 +485,31 @@ def window_costs_its_blocks(case):
     one = json.loads(case.run("info", EXAMPLE, "--json", "--window", f"{width - 1},{height - 1},1,1").out)["window"]
     expect(one["blocks"] == 1 and one["stored_bytes"] < whole["stored_bytes"], f"{one}")
     expect(whole["decoded_bytes"] == one["decoded_bytes"] * whole["blocks"], f"{one}")
-    for window in ("0,0,1", f"0,0,{width + 1},1", "-1,0,1,1", "0,0,0,1", "a,0,1,1", "0,0,1,1,1"):
+    for window in ("0,0,1", "-1,0,1,1", "0,0,0,1", "a,0,1,1", "0,0,1,1,1"):
         case.run("info", EXAMPLE, "--window=" + window, status=2)
+    for option in (f"--window=0,0,{width + 1},1", f"--window=0,{height},1,1", "--bbox=0,0,1,1", "--bbox=1,1,0,0"):
+        case.run("info", EXAMPLE, option, status=1)
+
+
+def a_part_is_that_part(case):
+    """By window and by box, in every command: the same samples, at their own place."""
+    about = json.loads(case.run("info", EXAMPLE, "--json").out)["georeference"]
+    part = json.loads(case.run("info", EXAMPLE, "--json", "--window", "100,200,50,40").out)
+    check_schema(part, info_schema())
+    west, south, east, north = part["georeference"]["extent"]
+    cell = about["sample_transform"][1]
+    expect(abs(west - about["extent"][0] - 100 * cell) < 1e-9 and abs(east - west - 50 * cell) < 1e-9, f"{part}")
+    box = json.loads(case.run("info", EXAMPLE, "--json", f"--bbox={west},{south},{east},{north}").out)
+    expect(box["window"] == part["window"] and box["heights"] == part["heights"], f"{box['window']}")
+    case.run("synth", EXAMPLE, "-l", 0, "-q", "-o", "whole.tif")
+    case.run("synth", EXAMPLE, "-l", 0, "-q", "--window", "100,200,50,40", "-o", "part.tif")
+    again = json.loads(case.run("info", "whole.tif", "--json", "--window", "100,200,50,40").out)
+    made = json.loads(case.run("info", "part.tif", "--json").out)
+    expect(made["heights"] == again["heights"] == part["heights"], f"{made['heights']}")
+    expect((made["width"], made["height"]) == (50, 40), f"{made}")
+    case.run("simplify", EXAMPLE, "--window", "100,200,50,40", "-e", 5, "--verify", "-q", "-o", "part.ply")
+    case.run("preview", EXAMPLE, "--window", "100,200,50,40", "-q", "-o", "part.png")
+    case.run("info", EXAMPLE, "--window", "0,0,5,5", "--bbox", "0,0,1,1", status=1)
 
 
 def corners_agree_with_gdal(case):
@@ -875,7 +898,7 @@ TESTS = [
     input_may_be_the_output, follows_the_umask,
     tells_a_full_stdout, tells_a_broken_pipe, closed_streams_do_not_go_into_the_output,
     bar_only_on_a_terminal, progress_lines_are_json, quiet_is_silent,
-    json_keeps_its_schema, real_files_keep_the_schema, window_costs_its_blocks, corners_agree_with_gdal,
+    json_keeps_its_schema, real_files_keep_the_schema, window_costs_its_blocks, a_part_is_that_part, corners_agree_with_gdal,
     names_of_any_bytes,
     formats_hold_the_same_heights, png_within_half_a_step, point_samples_are_kept, point_samples_of_the_andes_are_kept,
     area_means_stay_on_their_footprint,
