@@ -178,4 +178,11 @@ static inline double tl_plane_rounding(double magnitude)
     return magnitude * (40 * 0x1p-53);
 }
 
+/* The same where a plane's heights are summed up step by step, four samples at
+ * a time, along a block. */
+static inline double tl_error_rounding(double magnitude)
+{
+    return magnitude * ((80 + 4 * (TL_BLOCK / 4)) * 0x1p-53);
+}
+
 #endif

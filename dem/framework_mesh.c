@@ -260,6 +260,11 @@ size_t tl_framework_isolated_count(const tl_framework *framework)
     return framework->isolated_count;
 }
 
+double tl_framework_max_error(const tl_framework *framework)
+{
+    return framework->max_error;
+}
+
 bool tl_framework_has_point(const tl_framework *framework, int64_t i, int64_t j)
 {
     return tl_bit(framework->points, framework->words, i, j);
