@@ -7,8 +7,13 @@ typedef struct settings {
     common common;
     double max_error;
     bool max_error_given, verify;
-    int frame;
+    int frame, mesh, borders;
 } settings;
+
+static const char *const mesh_names[] = {[TL_MESH_QUADTREE] = "quadtree", [TL_MESH_TIN] = "tin", NULL};
+
+enum { BORDERS_FREE, BORDERS_CANONICAL };
+static const char *const border_names[] = {[BORDERS_FREE] = "free", [BORDERS_CANONICAL] = "canonical", NULL};
 
 static int report_check(const settings *set, const tl_mesh_report *check)
 {
@@ -47,16 +52,26 @@ static int write_and_check(const settings *set, const tl_source *dem, const tl_m
     return EXIT_DONE;
 }
 
-static void report(const settings *set, const tl_source *dem, const tl_framework *framework, const tl_mesh *mesh,
-                   double seconds)
+static void report(const settings *set, const tl_source *dem, uint64_t isolated, const tl_mesh *mesh, double seconds)
 {
     double samples = (double)dem->info.width * (double)dem->info.height;
     command_say(&set->common, "%s: %zu triangles, %zu vertices (%.3g %% of the samples), error <= %g, %.2f s",
                 set->common.output, mesh->triangle_count, mesh->vertex_count,
                 100 * (double)mesh->vertex_count / samples, set->max_error, seconds);
-    size_t isolated = tl_framework_isolated_count(framework);
     if (isolated)
-        command_say(&set->common, "%zu valid samples lie alone among voids and are in no triangle", isolated);
+        command_say(&set->common, "%llu valid samples lie alone among voids and are in no triangle",
+                    (unsigned long long)isolated);
+}
+
+static tl_status make_mesh(const settings *set, const tl_source *dem, const tl_run *run, tl_mesh **mesh,
+                           uint64_t *isolated, tl_error *error)
+{
+    tl_simplify_options options = {.max_error = set->max_error,
+                                   .frame = (tl_frame)set->frame,
+                                   .kind = (tl_mesh_kind)set->mesh,
+                                   .canonical_borders = set->borders == BORDERS_CANONICAL,
+                                   .run = run};
+    return tl_simplify(dem, &options, mesh, isolated, error);
 }
 
 static int simplify(const settings *set, const arguments *inputs)
@@ -74,20 +89,18 @@ static int simplify(const settings *set, const arguments *inputs)
     if (!dem)
         return command_failed(&bar, &error);
     progress_stage(&bar, "simplifying");
-    tl_framework_options options = {.max_error = set->max_error, .run = &run, .frame = (tl_frame)set->frame};
-    tl_framework *framework = tl_framework_build(dem, &options, &error);
     tl_mesh *mesh = NULL;
+    uint64_t isolated = 0;
     int status = EXIT_DONE;
-    if (!framework || tl_framework_mesh(framework, &mesh, &error) != TL_OK)
+    if (make_mesh(set, dem, &run, &mesh, &isolated, &error) != TL_OK)
         status = command_failed(&bar, &error);
     else {
         double seconds = progress_end(&bar);
         status = write_and_check(set, dem, mesh, &run, &bar);
         if (status == EXIT_DONE)
-            report(set, dem, framework, mesh, seconds);
+            report(set, dem, isolated, mesh, seconds);
     }
     tl_mesh_destroy(mesh);
-    tl_framework_destroy(framework);
     command_close(&opened);
     return status;
 }
@@ -98,6 +111,12 @@ static int run(const command *self, int argc, const char **argv, bool help)
     const option shape[] = {
         {"max-error", 'e', OPTION_NUMBER, &set.max_error, &set.max_error_given, "E",
          "largest vertical distance of any sample from the mesh, in the DEM's unit, 0...1e30 (needed)", 0, 1e30, NULL},
+        {"mesh", 0, OPTION_CHOICE, &set.mesh, NULL, "KIND",
+         "quadtree, or tin: irregular, less than half the triangles, slower (default: quadtree)", 0, 0, mesh_names},
+        {"borders", 0, OPTION_CHOICE, &set.borders, NULL, "RULE",
+         "canonical: by the rim's samples alone, so that tiles that share them join without a crack; a tin always has "
+         "these (default: free)",
+         0, 0, border_names},
         {"verify", 0, OPTION_FLAG, &set.verify, NULL, NULL, "measure the finished mesh against every sample", 0, 0,
          NULL},
         {"frame", 0, OPTION_CHOICE, &set.frame, NULL, "FRAME",
