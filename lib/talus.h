@@ -496,45 +496,6 @@ typedef struct tl_simplify_options {
 TL_API tl_status tl_simplify(const tl_source *dem, const tl_simplify_options *options, tl_mesh **out,
                              uint64_t *uncovered, tl_error *error);
 
-/* ---- Frameworks for every bound ------------------------------------------------------------------ */
-
-/* For every sample the largest bound at which the framework still needs it: so all frameworks of an elevation model.
- * Made in two passes over the model, which is never held as a whole. A pyramid may be used by any number of threads at
- * once, and does not need the model between its uses. */
-typedef struct tl_pyramid tl_pyramid;
-
-typedef struct tl_pyramid_options {
-    /* Keep errors as floats, in 4 bytes a sample. Else they are kept in one, rounded up to the next float with four
-     * bits of mantissa (1, 1.0625 ... 1.9375, 2, 2.125 ...; by 3 % on average, and down to 2^-15.8 of the model's range
-     * of heights): strict all the same, and for bounds that are such numbers themselves, as 0.5, 1, 5, 20 or 100, as
-     * good. */
-    bool exact;
-    tl_frame frame; /* see tl_framework_options */
-    const tl_run *run;
-} tl_pyramid_options;
-
-/* `options` may be NULL. */
-TL_API tl_pyramid *tl_pyramid_create(const tl_source *dem, const tl_pyramid_options *options, tl_error *error);
-TL_API void tl_pyramid_destroy(tl_pyramid *pyramid);
-/* The largest bound at which sample (i, j), which must lie in the grid, splits triangles; infinite where it always
- * does: beside voids, and where triangles would reach over the rim. */
-TL_API double tl_pyramid_error(const tl_pyramid *pyramid, int64_t i, int64_t j);
-
-/* What to take out of a pyramid: `triangles`, or `vertices`, or all that `max_error` needs. */
-typedef struct tl_selection {
-    double max_error; /* the bound, >= 0 */
-    /* Where not 0: at most so many, and as many as there can be: samples are taken by falling error, those that split
-     * larger triangles first where errors are equal, then row by row. Fewer than what voids and rims take alone is
-     * refused. */
-    uint64_t triangles, vertices;
-    const tl_run *run;
-} tl_selection;
-
-/* The framework of a selection. `dem` is the model of the pyramid; its heights are read once, twice with voids and
- * budgets. Those of larger bounds and smaller budgets are parts of each other. */
-TL_API tl_framework *tl_framework_from_pyramid(const tl_pyramid *pyramid, const tl_source *dem,
-                                               const tl_selection *selection, tl_error *error);
-
 /* ---- The field --------------------------------------------------------------------------------- */
 
 /* A way to refine a lattice, found by name. */
