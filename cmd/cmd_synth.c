@@ -60,21 +60,34 @@ static int synth(settings *set, const arguments *inputs)
     return status;
 }
 
-static bool names_scheme(const char *name)
+/* Schemes that a command has. */
+static size_t schemes_of(bool noise, tl_scheme out[16])
 {
-    const tl_scheme *s = tl_schemes();
-    for (; s->name; s++)
-        if (strcmp(s->name, name) == 0)
+    size_t count = 0;
+    for (const tl_scheme *s = tl_schemes(); s->name && count < 16; s++)
+        if (s->noise || !noise)
+            out[count++] = *s;
+    return count;
+}
+
+static bool names_scheme(const char *name, bool noise)
+{
+    tl_scheme schemes[16];
+    size_t count = schemes_of(noise, schemes);
+    for (size_t i = 0; i < count; i++)
+        if (strcmp(schemes[i].name, name) == 0)
             return true;
-    complain_of_choice("scheme", name, &tl_schemes()->name, (size_t)(s - tl_schemes()), sizeof *s);
+    complain_of_choice("scheme", name, &schemes->name, count, sizeof *schemes);
     return false;
 }
 
-static void list_schemes(void)
+static void list_schemes(bool noise)
 {
+    tl_scheme schemes[16];
+    size_t count = schemes_of(noise, schemes);
     printf("\nSchemes:\n");
-    for (const tl_scheme *s = tl_schemes(); s->name; s++)
-        printf("  %-22s  %s\n", s->name, s->summary);
+    for (size_t i = 0; i < count; i++)
+        printf("  %-22s  %s\n", schemes[i].name, schemes[i].summary);
 }
 
 static int run_synth(const command *self, int argc, const char **argv, bool help)
@@ -92,8 +105,8 @@ static int run_synth(const command *self, int argc, const char **argv, bool help
          "standard deviation of the height difference over one DEM sample, in the DEM's unit, 0...1e30 (default: "
          "measured)",
          0, 1e30, NULL},
-        {"scheme", 0, OPTION_TEXT, &set.field.scheme, NULL, "NAME", "way to refine, listed below (default: the first)",
-         0, 0, NULL},
+        {"scheme", 0, OPTION_TEXT, &set.field.scheme, NULL, "NAME",
+         "way to refine, listed below (default: terrain; stationary with --hurst or --delta)", 0, 0, NULL},
         {0}};
     const option input[] = {COMMON_INPUT(set.common), {0}};
     const option output[] = {COMMON_OUTPUT(set.common),
@@ -108,12 +121,13 @@ static int run_synth(const command *self, int argc, const char **argv, bool help
     int status;
     if (!command_begin(self, argc, argv, help, groups, -1, &rest, &status)) {
         if (help || status == EXIT_DONE)
-            list_schemes();
+            list_schemes(false);
         return status;
     }
     set.field.levels = (int)set.levels;
     set.field.seed = (uint64_t)set.seed;
-    bool good = (!set.field.scheme || names_scheme(set.field.scheme)) && command_output_ok(&set.common, true, true);
+    bool good =
+        (!set.field.scheme || names_scheme(set.field.scheme, false)) && command_output_ok(&set.common, true, true);
     status = good ? synth(&set, &rest) : EXIT_USAGE;
     arguments_free(&rest);
     return status;
@@ -163,11 +177,12 @@ static int run_noise(const command *self, int argc, const char **argv, bool help
     int status;
     if (!command_begin(self, argc, argv, help, groups, 0, &rest, &status)) {
         if (help || status == EXIT_DONE)
-            list_schemes();
+            list_schemes(true);
         return status;
     }
     set.noise.seed = (uint64_t)set.seed;
-    bool good = (!set.noise.scheme || names_scheme(set.noise.scheme)) && command_output_ok(&set.common, true, true);
+    bool good =
+        (!set.noise.scheme || names_scheme(set.noise.scheme, true)) && command_output_ok(&set.common, true, true);
     status = good ? noise(&set) : EXIT_USAGE;
     arguments_free(&rest);
     return status;

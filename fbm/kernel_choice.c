@@ -1,11 +1,14 @@
 /* Which kernels this processor runs, found once. (AVX-512 was measured: no faster than AVX2 for a level.) */
 #include "fbm/kernel.h"
+#include "fbm/terrain_kernel.h"
 
 #include <stdatomic.h>
 
 extern const fbm_kernel fbm_kernel_plain;
+extern const fbm_terrain_kernel fbm_terrain_kernel_plain;
 #ifdef FBM_HAVE_AVX2
 extern const fbm_kernel fbm_kernel_avx2;
+extern const fbm_terrain_kernel fbm_terrain_kernel_avx2;
 #endif
 
 static const fbm_kernel *const all[] = {
@@ -13,6 +16,14 @@ static const fbm_kernel *const all[] = {
     &fbm_kernel_avx2,
 #endif
     &fbm_kernel_plain,
+    NULL,
+};
+
+static const fbm_terrain_kernel *const all_terrain[] = {
+#ifdef FBM_HAVE_AVX2
+    &fbm_terrain_kernel_avx2,
+#endif
+    &fbm_terrain_kernel_plain,
     NULL,
 };
 
@@ -27,7 +38,7 @@ static size_t find_best(void)
     return best;
 }
 
-const fbm_kernel *const *fbm_kernels(void)
+static size_t best_index(void)
 {
     /* Threads that race here store the same value. */
     static atomic_size_t chosen; /* 0: not yet; else the index + 1 */
@@ -36,5 +47,15 @@ const fbm_kernel *const *fbm_kernels(void)
         index = find_best() + 1;
         atomic_store_explicit(&chosen, index, memory_order_relaxed);
     }
-    return all + (index - 1);
+    return index - 1;
+}
+
+const fbm_kernel *const *fbm_kernels(void)
+{
+    return all + best_index();
+}
+
+const fbm_terrain_kernel *const *fbm_terrain_kernels(void)
+{
+    return all_terrain + best_index();
 }

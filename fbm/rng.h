@@ -14,6 +14,7 @@ typedef enum fbm_noise_kind {
     FBM_NOISE_SPECTRUM = 3,     /* coefficients of the exact generator */
     FBM_NOISE_PLANE = 4,        /* slopes of its plane term */
     FBM_NOISE_VERTICES = 5,     /* (i, j): a vertex itself, as for simulated borders */
+    FBM_NOISE_CELLS = 6,        /* (i, j): a child of a cell, as its mean */
 } fbm_noise_kind;
 
 /* Writes the noise of columns first ... first + count - 1 of one row to out[count].

@@ -502,14 +502,16 @@ TL_API tl_status tl_simplify(const tl_source *dem, const tl_simplify_options *op
 typedef struct tl_scheme {
     const char *name;    /* "stationary" */
     const char *summary; /* one line */
+    bool noise;          /* tl_noise_create has it too: it needs no elevation model */
 } tl_scheme;
 
-/* The schemes, ended by an entry whose name is NULL. The first is the default. */
+/* The schemes, ended by an entry whose name is NULL. */
 TL_API const tl_scheme *tl_schemes(void);
 
 typedef struct tl_field_options {
     int levels;         /* halvings of the DEM's spacing, 0 ... 30 */
-    const char *scheme; /* a name of tl_schemes(); NULL: the default */
+    /* A name of tl_schemes(); NULL: "terrain" where neither hurst nor delta is given, else "stationary". */
+    const char *scheme;
     bool hurst_given, delta_given;
     double hurst; /* Hurst exponent of every level below the DEM, 0.01 ... 0.99; where not given, measured */
     double delta; /* standard deviation of the height difference of neighbouring DEM samples in the fractal model,
@@ -539,7 +541,7 @@ typedef struct tl_noise_options {
     double hurst; /* in (0, 1) */
     double delta; /* standard deviation of the height difference over one sample, >= 0 */
     uint64_t seed;
-    const char *scheme; /* a name of tl_schemes(); NULL: the default */
+    const char *scheme; /* a name of tl_schemes() with `noise`; NULL: "stationary" */
 } tl_noise_options;
 
 /* A fractional Brownian surface of size x size samples at unit spacing: S(h) = delta^2 |h|^(2 hurst). */

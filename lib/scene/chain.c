@@ -117,9 +117,10 @@ static tl_scheme schemes[SCHEMES_MAX];
 
 static void list_schemes(void)
 {
+    schemes[0] = (tl_scheme){.name = SCENE_TERRAIN, .summary = "detail shaped by the place, as real terrain has it"};
     for (size_t i = 0; fbm_schemes[i].name; i++) {
-        assert(i + 1 < SCHEMES_MAX);
-        schemes[i] = (tl_scheme){.name = fbm_schemes[i].name, .summary = fbm_schemes[i].summary};
+        assert(i + 2 < SCHEMES_MAX);
+        schemes[i + 1] = (tl_scheme){.name = fbm_schemes[i].name, .summary = fbm_schemes[i].summary, .noise = true};
     }
 }
 

@@ -29,7 +29,10 @@ fbm_window scene_chain_support(const scene_chain *chain, const scene_chain_targe
 tl_status scene_chain_run(const scene_chain *chain, const scene_chain_target *target, scene_chain_load load,
                           void *context, const char *name, tl_error *error);
 
-/* The scheme of this name, the first for NULL; NULL, described, when there is none. */
+/* The name of the scheme that is not in fbm_schemes. */
+#define SCENE_TERRAIN "terrain"
+
+/* The scheme of fBm of this name, the first for NULL; NULL, described, when there is none. */
 const fbm_scheme *scene_scheme(const char *name, tl_error *error);
 
 #endif

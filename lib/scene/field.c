@@ -6,7 +6,9 @@
 #include "lib/base/number.h"
 #include "lib/base/size.h"
 #include "lib/scene/chain.h"
+#include "lib/scene/patch.h"
 #include "lib/scene/roughness.h"
+#include "lib/scene/terrain.h"
 
 #include <assert.h>
 #include <math.h>
@@ -18,227 +20,31 @@ enum {
     /* Cells beyond the known samples that are made up so that the predictor has something to see. The output lies at
      * most half a cell outside of a known sample, and the halo of the refinement converges to 8 cells. */
     GROWTH = 10,
-    GROWTH_REACH = 2 * GROWTH, /* how far a made-up sample can see: two cells a pass */
 };
 
 typedef struct field {
     tl_source source;
     const tl_source *dem;
+    const char *scheme;
     scene_chain chain;
-    float trend; /* how far a slope goes on beyond the rim: see grow_sample */
+    scene_terrain *terrain; /* of cell means; NULL: the chain makes everything */
+    float trend;            /* how far a slope goes on beyond the rim: see scene_growth */
     tl_parameter *parameters;
 } field;
 
-/* ---- level 0: the samples, and what is made up around them ---- */
-
-/* A rectangle of level 0, in DEM samples, that may reach beyond the DEM. */
-typedef struct ground {
-    fbm_window window;
-    float *heights;
-    unsigned char *known; /* NULL: all are */
-} ground;
-
-static void ground_free(ground *g)
-{
-    free(g->heights);
-    free(g->known);
-}
-
-static bool inside_columns(const tl_source_info *dem, fbm_window w)
-{
-    return w.i >= 0 && w.i + (int64_t)w.width <= dem->width;
-}
-
-/* Whether the DEM has all of the window; one that goes around the globe has every column. */
-static bool inside(const tl_source_info *dem, fbm_window w)
-{
-    return (dem->wraps || inside_columns(dem, w)) && w.j >= 0 && w.j + (int64_t)w.height <= dem->height;
-}
-
-static fbm_window widened(fbm_window w, int by)
-{
-    w.i -= by;
-    w.j -= by;
-    w.width += 2 * (size_t)by;
-    w.height += 2 * (size_t)by;
-    w.stride = w.width;
-    return w;
-}
-
-/* Reads a part of the DEM to where it belongs in the window: its first sample to `out`. */
-static tl_status read_part(const tl_source *dem, tl_window part, float *out, size_t stride, tl_error *error)
-{
-    float *heights = tl_alloc_grid(part.width, part.height, sizeof *heights);
-    if (!heights)
-        return tl_fail_memory(error, dem->info.name);
-    tl_status status = tl_source_read(dem, 0, part, heights, error);
-    for (int64_t row = 0; row < part.height && status == TL_OK; row++)
-        memcpy(out + (size_t)row * stride, heights + row * part.width, (size_t)part.width * sizeof *out);
-    free(heights);
-    return status;
-}
-
-/* The rows y0 ... y1 - 1 of a window, column by column around the globe. */
-static tl_status read_around(const tl_source *dem, fbm_window w, int64_t y0, int64_t y1, float *out, tl_error *error)
-{
-    int64_t around = dem->info.width, x = (w.i % around + around) % around;
-    tl_status status = TL_OK;
-    for (int64_t done = 0, n; done < (int64_t)w.width && status == TL_OK; done += n, x = 0) {
-        n = tl_int64_min(around - x, (int64_t)w.width - done);
-        status = read_part(dem, (tl_window){x, y0, n, y1 - y0}, out + done, w.width, error);
-    }
-    return status;
-}
-
-/* Reads what the DEM has of the window; the rest becomes NaN. */
-static tl_status read_ground(const tl_source *dem, fbm_window w, float *out, tl_error *error)
-{
-    bool columns = inside_columns(&dem->info, w);
-    if (columns && inside(&dem->info, w))
-        return tl_source_read(dem, 0, (tl_window){w.i, w.j, (int64_t)w.width, (int64_t)w.height}, out, error);
-    for (size_t k = 0; k < w.width * w.height; k++)
-        out[k] = NAN;
-    int64_t y0 = tl_int64_max(w.j, 0), y1 = tl_int64_min(w.j + (int64_t)w.height, dem->info.height);
-    if (y0 >= y1)
-        return TL_OK;
-    float *first = out + (size_t)(y0 - w.j) * w.width;
-    if (dem->info.wraps && !columns)
-        return read_around(dem, w, y0, y1, first, error);
-    int64_t x0 = tl_int64_max(w.i, 0), x1 = tl_int64_min(w.i + (int64_t)w.width, dem->info.width);
-    if (x0 >= x1)
-        return TL_OK;
-    return read_part(dem, (tl_window){x0, y0, x1 - x0, y1 - y0}, first + (x0 - w.i), w.width, error);
-}
-
-/* The height of an unknown sample, from its neighbours that are known after `pass` passes: the mean, over the eight
- * directions, of the nearest height and `trend` times the step to it. For fBm on a line the best guess behind two known
- * samples has trend 2^(2H-1) - 1: flat at H = 1/2, straight at H = 1. NaN where no neighbour is known. */
-static float grow_sample(const field *f, const ground *g, size_t x, size_t y, unsigned char pass)
-{
-    float sum = 0;
-    int count = 0;
-    for (int dy = -1; dy <= 1; dy++)
-        for (int dx = -1; dx <= 1; dx++) {
-            size_t x1 = x + (size_t)dx, y1 = y + (size_t)dy, x2 = x1 + (size_t)dx, y2 = y1 + (size_t)dy;
-            /* sizes wrap around below 0, so one comparison does for both ends */
-            if ((!dx && !dy) || x1 >= g->window.width || y1 >= g->window.height)
-                continue;
-            size_t k1 = y1 * g->window.width + x1, k2 = y2 * g->window.width + x2;
-            if (g->known[k1] == 0 || g->known[k1] > pass)
-                continue;
-            bool second = x2 < g->window.width && y2 < g->window.height && g->known[k2] && g->known[k2] <= pass;
-            sum += g->heights[k1] + (second ? f->trend * (g->heights[k1] - g->heights[k2]) : 0);
-            count++;
-        }
-    return count ? sum / (float)count : NAN;
-}
-
-/* Fills the unknown samples ring by ring. known[k] is 0 for unknown, 1 for the DEM's, p + 1 for those of pass p; a pass
- * sees only those before it, so the result does not depend on the order of samples nor on where the window lies. */
-static void grow(const field *f, ground *g)
-{
-    for (unsigned char pass = 1; pass <= GROWTH; pass++)
-        for (size_t y = 0; y < g->window.height; y++)
-            for (size_t x = 0; x < g->window.width; x++) {
-                size_t k = y * g->window.width + x;
-                if (g->known[k])
-                    continue;
-                float height = grow_sample(f, g, x, y, pass);
-                if (isfinite(height)) {
-                    g->heights[k] = height;
-                    g->known[k] = (unsigned char)(pass + 1);
-                }
-            }
-    /* nothing that is kept can see what is left; it only must not be NaN */
-    for (size_t k = 0; k < g->window.width * g->window.height; k++)
-        if (!g->known[k])
-            g->heights[k] = 0;
-}
-
-static tl_status ground_allocate(ground *g, fbm_window w, bool with_known, const char *name, tl_error *error)
-{
-    *g = (ground){.window = w};
-    g->heights = tl_alloc_grid((int64_t)w.width, (int64_t)w.height, sizeof *g->heights);
-    g->known = with_known ? tl_alloc_grid((int64_t)w.width, (int64_t)w.height, 1) : NULL;
-    if (g->heights && (g->known || !with_known))
-        return TL_OK;
-    ground_free(g);
-    *g = (ground){0};
-    return tl_fail_memory(error, name);
-}
-
-/* Cuts the inner window `w` out of a wider ground. */
-static void crop(const ground *wide, ground *g)
-{
-    fbm_window w = g->window;
-    size_t dx = (size_t)(w.i - wide->window.i), dy = (size_t)(w.j - wide->window.j);
-    for (size_t row = 0; row < w.height; row++) {
-        size_t from = (dy + row) * wide->window.width + dx;
-        memcpy(g->heights + row * w.width, wide->heights + from, w.width * sizeof *g->heights);
-        memcpy(g->known + row * w.width, wide->known + from, w.width);
-    }
-}
-
-static tl_status ground_with_rim(const field *f, fbm_window w, ground *g, tl_error *error)
-{
-    const char *name = f->dem->info.name;
-    ground wide;
-    tl_status status = ground_allocate(&wide, widened(w, GROWTH_REACH), true, name, error);
-    if (status != TL_OK)
-        return status;
-    status = read_ground(f->dem, wide.window, wide.heights, error);
-    if (status == TL_OK)
-        status = ground_allocate(g, w, true, name, error);
-    if (status == TL_OK) {
-        for (size_t k = 0; k < wide.window.width * wide.window.height; k++)
-            wide.known[k] = !isnan(wide.heights[k]);
-        grow(f, &wide);
-        crop(&wide, g);
-    }
-    ground_free(&wide);
-    return status;
-}
-
-static bool all_known(const float *heights, size_t count)
-{
-    for (size_t k = 0; k < count; k++)
-        if (isnan(heights[k]))
-            return false;
-    return true;
-}
-
-static tl_status ground_read(const field *f, fbm_window w, ground *g, tl_error *error)
-{
-    if (inside(&f->dem->info, w)) {
-        tl_status status = ground_allocate(g, w, false, f->dem->info.name, error);
-        if (status == TL_OK)
-            status = read_ground(f->dem, w, g->heights, error);
-        if (status != TL_OK || all_known(g->heights, w.width * w.height))
-            return status;
-        ground_free(g);
-        *g = (ground){0};
-    }
-    return ground_with_rim(f, w, g, error);
-}
-
 /* ---- voids ---- */
-
-static bool sample_known(const ground *g, int64_t i, int64_t j)
-{
-    return g->known[(size_t)(j - g->window.j) * g->window.width + (size_t)(i - g->window.i)] == 1;
-}
 
 /* Voids of the DEM stay voids. A cell of an area raster is known when the sample whose cell it lies in is; a point when
  * the samples around it, one, two or four, all are. */
-static void cut_voids(const ground *g, bool area, int level, tl_window window, float *out, int64_t stride)
+static void cut_voids(const scene_patch *g, bool area, int level, tl_window window, float *out, int64_t stride)
 {
     int64_t unit = (int64_t)1 << level, mask = area ? 0 : unit - 1;
     for (int64_t row = 0; row < window.height; row++)
         for (int64_t column = 0; column < window.width; column++) {
             int64_t x = window.x + column, y = window.y + row;
             int64_t i = x >> level, j = y >> level, right = (x & mask) != 0, below = (y & mask) != 0;
-            if (!sample_known(g, i, j) || !sample_known(g, i + right, j) || !sample_known(g, i, j + below) ||
-                !sample_known(g, i + right, j + below))
+            if (!scene_patch_known(g, i, j) || !scene_patch_known(g, i + right, j) ||
+                !scene_patch_known(g, i, j + below) || !scene_patch_known(g, i + right, j + below))
                 out[row * stride + column] = NAN;
         }
 }
@@ -248,7 +54,7 @@ static void cut_voids(const ground *g, bool area, int level, tl_window window, f
 static tl_status load(void *context, fbm_window window, float *buffer, tl_error *error)
 {
     (void)error;
-    const ground *g = context;
+    const scene_patch *g = context;
     assert(window.i == g->window.i && window.width == g->window.width && window.height == g->window.height);
     memcpy(buffer, g->heights, window.width * window.height * sizeof *buffer);
     return TL_OK;
@@ -267,19 +73,34 @@ static scene_chain_target target_of(const field *f, int level, tl_window window,
         .out = out};
 }
 
+static tl_status read_terrain(const field *f, int level, tl_window window, float *out, int64_t stride, tl_error *error)
+{
+    scene_patch patch;
+    fbm_window target = {window.x, window.y, (size_t)window.width, (size_t)window.height, (size_t)stride};
+    tl_status status = scene_terrain_read(f->terrain, f->dem, level, target, out, &patch, error);
+    if (status != TL_OK)
+        return status;
+    if (patch.known)
+        cut_voids(&patch, true, level, window, out, stride);
+    scene_patch_free(&patch);
+    return TL_OK;
+}
+
 static tl_status read_block(const field *f, int level, tl_window window, float *out, int64_t stride, tl_error *error)
 {
+    if (f->terrain)
+        return read_terrain(f, level, window, out, stride, error);
     scene_chain_target target = target_of(f, level, window, out, stride);
     fbm_window support = scene_chain_support(&f->chain, &target);
     support.stride = support.width;
-    ground g;
-    tl_status status = ground_read(f, support, &g, error);
+    scene_patch g;
+    tl_status status = scene_patch_read(f->dem, (scene_growth){GROWTH, f->trend}, support, &g, error);
     if (status != TL_OK)
         return status;
     status = scene_chain_run(&f->chain, &target, load, &g, f->source.info.name, error);
     if (status == TL_OK && g.known)
         cut_voids(&g, f->source.info.type == TL_RASTER_AREA, level, window, out, stride);
-    ground_free(&g);
+    scene_patch_free(&g);
     return status;
 }
 
@@ -352,6 +173,7 @@ static void field_destroy(tl_source *self)
     field *f = (field *)self;
     tl_crs_release(self->info.georef.crs);
     free(f->parameters);
+    free(f->terrain);
     free(f);
 }
 
@@ -373,25 +195,34 @@ static tl_status check(const tl_source *dem, const tl_field_options *o, tl_error
     return TL_OK;
 }
 
-/* Amplitude of the residual filter at each level, and the exponent for its weights. What is not given is predicted from
- * the measurement. A measured octave of variance sigma^2 is that of fBm whose delta makes it so, at an exponent
- * below 1. */
-static void schedule(field *f, const tl_field_options *o, const tl_roughness *measured)
+/* The octaves below the DEM. What is not given is predicted from the measurement; of fBm with given delta, an octave
+ * has the variance that its details have. */
+static void schedule(const field *f, const tl_field_options *o, const tl_roughness *measured, scene_octave *octaves)
 {
-    scene_octave octaves[SCENE_LEVEL_MAX + 1];
     scene_predict_octaves(measured, &f->dem->info.georef, octaves, SCENE_LEVEL_MAX + 1);
     bool area = f->dem->info.type == TL_RASTER_AREA;
     double amplitude = o->delta;
-    for (int l = 0; l <= SCENE_LEVEL_MAX && l <= o->levels; l++) {
+    for (int l = 0; l <= SCENE_LEVEL_MAX; l++) {
         double hurst = o->hurst_given ? o->hurst : octaves[l].hurst;
-        double model = fmin(fmax(hurst, FBM_HURST_MIN), FBM_HURST_MAX);
+        double unit = sqrt(fbm_detail_of_fbm(fmin(fmax(hurst, FBM_HURST_MIN), FBM_HURST_MAX), area));
         if (l > 0)
             amplitude *= fbm_exp2(-hurst);
         if (!o->delta_given && (l == 0 || !o->hurst_given))
-            amplitude = octaves[l].sigma / sqrt(fbm_detail_of_fbm(model, area));
+            amplitude = octaves[l].sigma / unit;
+        octaves[l] = (scene_octave){.sigma = amplitude * unit, .hurst = hurst};
+    }
+}
+
+/* Amplitude of the residual filter at each level, and the exponent for its weights: a measured octave of variance
+ * sigma^2 is that of fBm whose delta makes it so, at an exponent below 1. */
+static void set_steps(field *f, const tl_field_options *o, const scene_octave *octaves)
+{
+    bool area = f->dem->info.type == TL_RASTER_AREA;
+    for (int l = 0; l <= SCENE_LEVEL_MAX && l <= o->levels; l++) {
+        double model = fmin(fmax(octaves[l].hurst, FBM_HURST_MIN), FBM_HURST_MAX);
         fbm_step *step = &f->chain.steps[l];
         step->scheme->weights(model, &step->weights);
-        step->amplitude = (float)amplitude;
+        step->amplitude = (float)(octaves[l].sigma / sqrt(fbm_detail_of_fbm(model, area)));
         step->period = f->dem->info.wraps ? f->dem->info.width << l : 0;
         if (l == 0)
             f->trend = (float)(fbm_exp2(2 * model - 1) - 1);
@@ -412,9 +243,8 @@ static tl_status note_all(field *f, const tl_field_options *o, const tl_roughnes
         tl_number_text(o->delta, delta);
     if (measured->measurable)
         snprintf(found, sizeof found, "sigma %.6g, exponent %.4g", measured->sigma, measured->hurst);
-    const tl_parameter all[] = {{"levels", levels}, {"scheme", f->chain.steps[0].scheme->name},
-                                {"seed", seed},     {"hurst", hurst},
-                                {"delta", delta},   {"measured", found}};
+    const tl_parameter all[] = {{"levels", levels}, {"scheme", f->scheme}, {"seed", seed},
+                                {"hurst", hurst},   {"delta", delta},      {"measured", found}};
     size_t count = sizeof all / sizeof *all - (o->hurst_given && o->delta_given);
     tl_status status = tl_parameters_add_origin(&f->parameters, &f->source.info.parameter_count, &f->dem->info, error);
     for (size_t i = 0; i < count && status == TL_OK; i++)
@@ -446,15 +276,40 @@ static void place(field *f, int levels)
     info->georef.cell_y *= scale;
 }
 
+static tl_status prepare(field *f, const tl_field_options *o, tl_error *error)
+{
+    bool terrain = o->scheme ? !strcmp(o->scheme, SCENE_TERRAIN) : !o->hurst_given && !o->delta_given;
+    const fbm_scheme *scheme = scene_scheme(terrain ? NULL : o->scheme, error);
+    if (!scheme)
+        return TL_ERROR_ARGUMENT;
+    f->scheme = terrain ? SCENE_TERRAIN : scheme->name;
+    for (int l = 0; l <= SCENE_LEVEL_MAX; l++)
+        f->chain.steps[l] = (fbm_step){.scheme = scheme, .seed = o->seed, .level = l};
+    scene_detail detail = {.noise = 0};
+    tl_status status = TL_OK;
+    if (terrain || !(o->hurst_given && o->delta_given))
+        status = scene_detail_measure(f->dem, o->run, &detail, error);
+    if (status != TL_OK)
+        return status;
+    tl_roughness measured = scene_roughness_of(&detail);
+    scene_octave octaves[SCENE_LEVEL_MAX + 1];
+    schedule(f, o, &measured, octaves);
+    set_steps(f, o, octaves);
+    place(f, o->levels);
+    if (terrain && o->levels > 0 && f->dem->info.type == TL_RASTER_AREA) {
+        f->terrain = malloc(sizeof *f->terrain);
+        if (!f->terrain)
+            return tl_fail_memory(error, f->dem->info.name);
+        status = scene_terrain_measure(f->dem, &detail, octaves, o->levels, o->seed, o->run, f->terrain, error);
+    }
+    return status == TL_OK ? note_all(f, o, &measured, error) : status;
+}
+
 tl_source *tl_field_create(const tl_source *dem, const tl_field_options *options, tl_error *error)
 {
     static const tl_field_options defaults;
     const tl_field_options *o = options ? options : &defaults;
-    const fbm_scheme *scheme = scene_scheme(o->scheme, error);
-    if (!scheme || check(dem, o, error) != TL_OK)
-        return NULL;
-    tl_roughness measured = {0};
-    if (!(o->hurst_given && o->delta_given) && tl_roughness_measure(dem, o->run, &measured, error) != TL_OK)
+    if (check(dem, o, error) != TL_OK)
         return NULL;
     field *f = calloc(1, sizeof *f);
     if (!f) {
@@ -470,11 +325,7 @@ tl_source *tl_field_create(const tl_source *dem, const tl_field_options *options
     f->source.info.parameters = NULL;
     f->dem = dem;
     tl_crs_retain(f->source.info.georef.crs);
-    for (int l = 0; l <= SCENE_LEVEL_MAX; l++)
-        f->chain.steps[l] = (fbm_step){.scheme = scheme, .seed = o->seed, .level = l};
-    schedule(f, o, &measured);
-    place(f, o->levels);
-    if (note_all(f, o, &measured, error) == TL_OK)
+    if (prepare(f, o, error) == TL_OK)
         return &f->source;
     field_destroy(&f->source);
     return NULL;

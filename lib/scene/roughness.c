@@ -74,14 +74,14 @@ static void add(fbm_detail *sum, const fbm_detail *part)
     sum->count += part->count;
 }
 
-static tl_roughness conclude(const fbm_detail octaves[2], double quantum)
+tl_roughness scene_roughness_of(const scene_detail *detail)
 {
+    const fbm_detail *octaves = detail->octaves;
     tl_roughness result = {0};
     if (octaves[0].count < MIN_BLOCKS || octaves[1].count < MIN_BLOCKS)
         return result;
-    double noise = quantum * quantum / 12;
-    double finest = sqrt(fbm_detail_variance(&octaves[0], 0, noise)),
-           next = sqrt(fbm_detail_variance(&octaves[1], 1, noise));
+    double finest = sqrt(fbm_detail_variance(&octaves[0], 0, detail->noise)),
+           next = sqrt(fbm_detail_variance(&octaves[1], 1, detail->noise));
     if (!(finest > 0) || !(next > 0) || !isfinite(finest) || !isfinite(next))
         return result;
     result.measurable = true;
@@ -90,7 +90,7 @@ static tl_roughness conclude(const fbm_detail octaves[2], double quantum)
     return result;
 }
 
-tl_status tl_roughness_measure(const tl_source *dem, const tl_run *run, tl_roughness *out, tl_error *error)
+tl_status scene_detail_measure(const tl_source *dem, const tl_run *run, scene_detail *out, tl_error *error)
 {
     const tl_source_info *info = &dem->info;
     measurement m = {.dem = dem, .columns = tl_div_up(info->width, BLOCK)};
@@ -102,13 +102,21 @@ tl_status tl_roughness_measure(const tl_source *dem, const tl_run *run, tl_rough
     uint64_t samples = (uint64_t)info->width * (uint64_t)info->height;
     tl_status status = tl_parallel_for(run, (uint64_t)blocks, samples, measure_block, &m, error);
     if (status == TL_OK) {
-        fbm_detail octaves[2] = {{0}, {0}};
+        *out = (scene_detail){.noise = info->quantum * info->quantum / 12};
         for (int64_t i = 0; i < blocks; i++)
             for (int k = 0; k < 2; k++)
-                add(&octaves[k], &m.sums[i][k]);
-        *out = conclude(octaves, info->quantum);
+                add(&out->octaves[k], &m.sums[i][k]);
     }
     free(m.sums);
+    return status;
+}
+
+tl_status tl_roughness_measure(const tl_source *dem, const tl_run *run, tl_roughness *out, tl_error *error)
+{
+    scene_detail detail;
+    tl_status status = scene_detail_measure(dem, run, &detail, error);
+    if (status == TL_OK)
+        *out = scene_roughness_of(&detail);
     return status;
 }
 
@@ -121,9 +129,8 @@ void scene_predict_octaves(const tl_roughness *measured, const tl_georef *georef
         return;
     }
     double hurst = measured->hurst, sigma = measured->sigma;
-    /* the measured octave's parents are two samples apart; ratios are those of metres to metres */
-    double parent = 2 * sqrt(georef->cell_x * georef->cell_y);
-    double ratio = fbm_log2(sigma * georef->height_unit / parent);
+    /* of the finest measured detail to the cell, metres to metres */
+    double ratio = fbm_log2(sigma * georef->height_unit / sqrt(georef->cell_x * georef->cell_y));
     for (int j = 0; j < count; j++) {
         hurst += .276 * (1.191 + .266 * (ratio + 5) - hurst);
         sigma *= fbm_exp2(-hurst);

@@ -2,7 +2,18 @@
 #ifndef SCENE_ROUGHNESS_H
 #define SCENE_ROUGHNESS_H
 
+#include "fbm/estimate.h"
 #include "lib/talus.h"
+
+/* What a raster's two finest octaves hold: octave 0 is that of its samples, octave 1 that of their 2 x 2 means. */
+typedef struct scene_detail {
+    fbm_detail octaves[2];
+    double noise; /* variance of the samples' quantisation */
+} scene_detail;
+
+/* Reads the raster once. */
+tl_status scene_detail_measure(const tl_source *dem, const tl_run *run, scene_detail *out, tl_error *error);
+tl_roughness scene_roughness_of(const scene_detail *detail);
 
 /* The detail of one octave below the samples. */
 typedef struct scene_octave {

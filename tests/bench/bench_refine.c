@@ -2,6 +2,7 @@
  * that runs here, beside a memcpy of the same bytes. */
 #include "fbm/kernel.h"
 #include "fbm/refine.h"
+#include "fbm/terrain_kernel.h"
 #include "tests/bench/bench.h"
 
 #include <math.h>
@@ -90,6 +91,76 @@ static void measure(const fbm_scheme *scheme, size_t side)
     finish(&c);
 }
 
+/* The same for terrain's detail: its levels are cells, three of them as from a DEM to an eighth of its spacing. */
+enum { OCTAVES = 3 };
+
+typedef struct terrain_chain {
+    const fbm_kernel *noise;
+    const fbm_terrain_kernel *kernel;
+    int first;
+    fbm_terrain_step step;
+    fbm_window windows[OCTAVES + 1];
+    float *heights[OCTAVES + 1], *energy[OCTAVES + 1];
+    float *scratch;
+} terrain_chain;
+
+static void run_terrain(void *context)
+{
+    terrain_chain *c = context;
+    for (int l = c->first; l < OCTAVES; l++)
+        c->kernel->refine(c->noise, &c->step, c->heights[l], c->energy[l], c->windows[l], c->heights[l + 1],
+                          l + 1 < OCTAVES ? c->energy[l + 1] : NULL, c->windows[l + 1], c->scratch);
+}
+
+static void plan_terrain(terrain_chain *c, size_t side)
+{
+    c->step = (fbm_terrain_step){.children_x = 5,
+                                 .children_y = 7,
+                                 .gains = {1, 1, 1},
+                                 .steer = 1,
+                                 .steer_slope2 = .1F,
+                                 .level = 4,
+                                 .level_slope = .3F,
+                                 .limit = .01F};
+    c->windows[OCTAVES] = (fbm_window){0, 0, side, side, side};
+    for (int l = OCTAVES; l > 0; l--)
+        c->windows[l - 1] = fbm_terrain_support(c->windows[l]);
+    for (int l = 0; l <= OCTAVES; l++) {
+        size_t count = c->windows[l].stride * c->windows[l].height;
+        c->heights[l] = allocate(count, sizeof(float));
+        c->energy[l] = allocate(count, sizeof(float));
+        for (size_t k = 0; k < count; k++) {
+            c->heights[l][k] = (float)(k * 2654435761U >> 8 & 0xff);
+            c->energy[l][k] = 1;
+        }
+    }
+    c->scratch = allocate(fbm_terrain_scratch(side, side), sizeof(float));
+}
+
+static void measure_terrain(size_t side)
+{
+    terrain_chain c = {0};
+    double count = (double)side * (double)side, copy = bench_copy(side * side * sizeof(float), RUNS) / count;
+    plan_terrain(&c, side);
+    printf("terrain, tile of %zu x %zu; memcpy of the same bytes %.3f ns a sample\n", side, side, 1e9 * copy);
+    printf("  %-8s %10s %10s %14s\n", "kernel", "1 level", "3 levels", "3 levels/copy");
+    const fbm_kernel *const *noise = fbm_kernels();
+    for (const fbm_terrain_kernel *const *kernel = fbm_terrain_kernels(); *kernel; kernel++, noise++) {
+        c.kernel = *kernel;
+        c.noise = *noise;
+        c.first = 0;
+        double levels = bench_minimum(run_terrain, &c, RUNS) / count;
+        c.first = OCTAVES - 1;
+        double level = bench_minimum(run_terrain, &c, RUNS) / count;
+        printf("  %-8s %7.3f ns %7.3f ns %14.1f\n", (*kernel)->name, 1e9 * level, 1e9 * levels, levels / copy);
+    }
+    for (int l = 0; l <= OCTAVES; l++) {
+        free(c.heights[l]);
+        free(c.energy[l]);
+    }
+    free(c.scratch);
+}
+
 int main(void)
 {
     bench_print_machine();
@@ -97,5 +168,7 @@ int main(void)
         measure(scheme, 257);
         measure(scheme, 513);
     }
+    measure_terrain(256);
+    measure_terrain(512);
     return 0;
 }

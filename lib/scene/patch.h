@@ -1,0 +1,35 @@
+/* Samples of an elevation model, with what is made up beyond its rim and in its voids. */
+#ifndef SCENE_PATCH_H
+#define SCENE_PATCH_H
+
+#include "fbm/refine.h"
+#include "lib/talus.h"
+
+/* A rectangle of level 0, in samples, that may reach beyond the model. */
+typedef struct scene_patch {
+    fbm_window window;    /* without gaps between rows */
+    float *heights;       /* all finite */
+    unsigned char *known; /* 1 where the height is the model's; NULL: everywhere */
+} scene_patch;
+
+/* How heights are made up: ring by ring, for `rings` rings around known samples, each the mean over directions of the
+ * neighbour's height and a share `trend` of the step to it. What lies farther is 0. */
+typedef struct scene_growth {
+    int rings; /* at most 100 */
+    float trend;
+} scene_growth;
+
+/* Reads a patch; the result does not depend on where the window lies. Free with scene_patch_free. */
+tl_status scene_patch_read(const tl_source *dem, scene_growth growth, fbm_window window, scene_patch *out,
+                           tl_error *error);
+void scene_patch_free(scene_patch *patch);
+
+static inline bool scene_patch_known(const scene_patch *p, int64_t i, int64_t j)
+{
+    return !p->known || p->known[(size_t)(j - p->window.j) * p->window.width + (size_t)(i - p->window.i)] == 1;
+}
+
+/* The window with `by` samples more on every side. */
+fbm_window scene_widened(fbm_window window, int by);
+
+#endif
