@@ -1,13 +1,20 @@
 #include "cmd/command.h"
 
+#include <math.h>
 #include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
 #include <sys/stat.h>
 
 typedef struct settings {
     common common;
-    double max_error;
+    double max_error; /* asked for; or what a budget comes to */
     bool max_error_given, verify;
     int frame, mesh, borders;
+    int64_t triangles, vertices; /* budgets; 0: none */
+    const char *keep;
+    double share; /* of the samples, by --keep; 0: none */
+    const char *error_cache;
 } settings;
 
 static const char *const mesh_names[] = {[TL_MESH_QUADTREE] = "quadtree", [TL_MESH_TIN] = "tin", NULL};
@@ -63,9 +70,44 @@ static void report(const settings *set, const tl_source *dem, uint64_t isolated,
                     (unsigned long long)isolated);
 }
 
-static tl_status make_mesh(const settings *set, const tl_source *dem, const tl_run *run, tl_mesh **mesh,
-                           uint64_t *isolated, tl_error *error)
+/* Whether the mesh comes out of an error pyramid. */
+static bool by_pyramid(const settings *set)
 {
+    return set->triangles || set->vertices || set->share > 0 || set->error_cache;
+}
+
+static tl_pyramid *make_pyramid(const settings *set, const tl_source *dem, const tl_run *run, tl_error *error)
+{
+    tl_pyramid_options options = {.frame = (tl_frame)set->frame, .run = run};
+    return tl_pyramid_create(dem, &options, error);
+}
+
+static tl_status select_mesh(settings *set, const tl_source *dem, const tl_run *run, tl_mesh **mesh, uint64_t *isolated,
+                             tl_error *error)
+{
+    double samples = (double)dem->info.width * (double)dem->info.height;
+    tl_selection selection = {.max_error = set->max_error,
+                              .triangles = (uint64_t)set->triangles,
+                              .vertices = set->share > 0 ? (uint64_t)fmax(1, floor(samples * set->share))
+                                                         : (uint64_t)set->vertices,
+                              .run = run};
+    tl_pyramid *pyramid = make_pyramid(set, dem, run, error);
+    tl_framework *framework = pyramid ? tl_framework_from_pyramid(pyramid, dem, &selection, error) : NULL;
+    tl_status status = framework ? tl_framework_mesh(framework, mesh, error) : error->status;
+    if (status == TL_OK) {
+        set->max_error = tl_framework_max_error(framework);
+        *isolated = tl_framework_isolated_count(framework);
+    }
+    tl_framework_destroy(framework);
+    tl_pyramid_destroy(pyramid);
+    return status;
+}
+
+static tl_status make_mesh(settings *set, const tl_source *dem, const tl_run *run, tl_mesh **mesh, uint64_t *isolated,
+                           tl_error *error)
+{
+    if (by_pyramid(set))
+        return select_mesh(set, dem, run, mesh, isolated, error);
     tl_simplify_options options = {.max_error = set->max_error,
                                    .frame = (tl_frame)set->frame,
                                    .kind = (tl_mesh_kind)set->mesh,
@@ -74,7 +116,7 @@ static tl_status make_mesh(const settings *set, const tl_source *dem, const tl_r
     return tl_simplify(dem, &options, mesh, isolated, error);
 }
 
-static int simplify(const settings *set, const arguments *inputs)
+static int simplify(settings *set, const arguments *inputs)
 {
     progress bar;
     tl_error error;
@@ -105,12 +147,49 @@ static int simplify(const settings *set, const arguments *inputs)
     return status;
 }
 
+/* Whether --keep is understood. */
+static bool read_share(settings *set)
+{
+    if (!set->keep)
+        return true;
+    char *end;
+    double percent = strtod(set->keep, &end);
+    if (end != set->keep && (!*end || strcmp(end, "%") == 0) && percent > 0 && percent <= 100) {
+        set->share = percent / 100;
+        return true;
+    }
+    complain("--keep: a share in percent, above 0 and up to 100, is wanted, not '%.100s'", set->keep);
+    return false;
+}
+
+static bool settings_ok(settings *set)
+{
+    int rules = set->max_error_given + (set->triangles > 0) + (set->vertices > 0) + (set->keep != NULL);
+    if (rules == 0)
+        complain("no error bound given; give --max-error E, in the DEM's unit of height, or --budget N");
+    else if (rules > 1)
+        complain("--max-error, --budget, --budget-vertices and --keep exclude each other; give one");
+    else if (!read_share(set))
+        return false;
+    else if (by_pyramid(set) && (set->mesh != TL_MESH_QUADTREE || set->borders != BORDERS_FREE))
+        complain("--budget, --budget-vertices and --keep choose among quadtree meshes with free borders; leave "
+                 "--mesh and --borders away");
+    else
+        return true;
+    return false;
+}
+
 static int run(const command *self, int argc, const char **argv, bool help)
 {
     settings set = {0};
     const option shape[] = {
         {"max-error", 'e', OPTION_NUMBER, &set.max_error, &set.max_error_given, "E",
          "largest vertical distance of any sample from the mesh, in the DEM's unit, 0...1e30 (needed)", 0, 1e30, NULL},
+        {"budget", 0, OPTION_INTEGER, &set.triangles, NULL, "N",
+         "instead of --max-error: at most N triangles, those that matter most, 1...4e9", 1, 4e9, NULL},
+        {"budget-vertices", 0, OPTION_INTEGER, &set.vertices, NULL, "N", "the same for vertices", 1, 4e9, NULL},
+        {"keep", 0, OPTION_TEXT, &set.keep, NULL, "SHARE", "the same for a share of the samples, as 48.76%", 0, 0,
+         NULL},
         {"mesh", 0, OPTION_CHOICE, &set.mesh, NULL, "KIND",
          "quadtree, or tin: irregular, less than half the triangles, slower (default: quadtree)", 0, 0, mesh_names},
         {"borders", 0, OPTION_CHOICE, &set.borders, NULL, "RULE",
@@ -131,11 +210,8 @@ static int run(const command *self, int argc, const char **argv, bool help)
     int status;
     if (!command_begin(self, argc, argv, help, groups, -1, &rest, &status))
         return status;
-    if (!set.max_error_given) {
-        complain("no error bound given; give --max-error E, in the DEM's unit of height");
-        status = EXIT_USAGE;
-    } else
-        status = command_output_ok(&set.common, false, true) ? simplify(&set, &rest) : EXIT_USAGE;
+    bool good = settings_ok(&set) && command_output_ok(&set.common, false, true);
+    status = good ? simplify(&set, &rest) : EXIT_USAGE;
     arguments_free(&rest);
     return status;
 }
