@@ -34,6 +34,7 @@ typedef struct band {
     tl_tin_soup *soup;
     side sides[SIDES];
     int64_t *stack;
+    bool narrow; /* two rows or columns: each side's second row is the other rim */
 } band;
 
 /* ---- Places ------------------------------------------------------------------------------------------ */
@@ -351,7 +352,10 @@ static void string_outer(const band *self, const side *of, chain *out)
         } else if (of->outer[at] != NONE) {
             out->at[out->count] = at;
             out->number[out->count] = of->outer[at];
-            out->joined[out->count++] = true;
+            /* where the diagonal of a corner's cell is void, the corner's own triangle takes its edges */
+            bool cut =
+                (at == 0 && !valid(self, of, 1, 1)) || (at == of->length - 2 && !valid(self, of, 1, of->length - 2));
+            out->joined[out->count++] = !cut || self->narrow;
         }
     }
     if (out->count)
@@ -489,31 +493,31 @@ static void free_sides(band *self)
     free(self->stack);
 }
 
-static tl_status choose_rim(band *self, bool narrow, tl_error *error)
+static tl_status choose_rim(band *self, tl_error *error)
 {
-    tl_status status = narrow ? TL_OK : find_border(self, error);
+    tl_status status = self->narrow ? TL_OK : find_border(self, error);
     for (int k = 0; k < SIDES && status == TL_OK; k++) {
         side *of = &self->sides[k];
-        if (!narrow)
+        if (!self->narrow)
             status = add_lone(self, of, error);
         keep_ends(self, of);
-        if (narrow)
+        if (self->narrow)
             keep_beside_voids(self, of);
         keep_side(self, of, false);
         if (self->rim->sag)
             keep_side(self, of, true);
     }
     for (int k = 0; k < SIDES && status == TL_OK; k++) {
-        if (!narrow)
+        if (!self->narrow)
             join_lone(self, &self->sides[k]);
         status = number_rim(self, &self->sides[k], error);
     }
     return status;
 }
 
-static tl_status fill_band(band *self, bool narrow, tl_error *error)
+static tl_status fill_band(band *self, tl_error *error)
 {
-    if (narrow) {
+    if (self->narrow) {
         int k = self->rim->height == 2 ? TOP : LEFT;
         return fill_side(self, &self->sides[k], &self->sides[k + 1], error);
     }
@@ -527,11 +531,10 @@ static tl_status fill_band(band *self, bool narrow, tl_error *error)
 
 tl_status tl_tin_add_rim(const tl_tin_rim *rim, tl_tin_soup *soup, tl_error *error)
 {
-    band self = {.rim = rim, .soup = soup};
-    bool narrow = rim->width == 2 || rim->height == 2;
-    tl_status status = make_sides(&self) ? choose_rim(&self, narrow, error) : tl_fail_memory(error, "the mesh");
+    band self = {.rim = rim, .soup = soup, .narrow = rim->width == 2 || rim->height == 2};
+    tl_status status = make_sides(&self) ? choose_rim(&self, error) : tl_fail_memory(error, "the mesh");
     if (status == TL_OK)
-        status = fill_band(&self, narrow, error);
+        status = fill_band(&self, error);
     free_sides(&self);
     return status;
 }
