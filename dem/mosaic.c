@@ -4,7 +4,10 @@
  * Hard joins: a sample that has a height keeps it. Feathered ones: the k-th member that has one counts with weight w_k
  * times (1 - w) of all before it, where w rises from the member's rim inwards and is 1 from 32 samples on. So the first
  * alone counts where it is deep inside, nothing jumps at the rim of any, and where two overlap by less than 32 samples
- * the change takes all of the overlap. */
+ * the change takes all of the overlap.
+ *
+ * A coarser level is made from the finest, but for one that every file holds a reduced copy of, with its cells on those
+ * of the mosaic: there blocks of that level are put together in the same way. */
 #include "dem/mosaic.h"
 
 #include "dem/crs.h"
@@ -30,6 +33,7 @@ typedef struct mosaic {
         size_t layer, placement;
     } * places; /* of each member: the first that it has */
     bool feather;
+    uint64_t reduced; /* bit k: level -k can be put together from the members' own */
     char *name;
 } mosaic;
 
@@ -44,6 +48,7 @@ typedef struct mix {
 /* A block of a lattice that fills up with heights. */
 typedef struct canvas {
     const mosaic *owner;
+    int halvings; /* the block is one of level -halvings; all that is said of places is at the finest one */
     tl_window window;
     float *heights, *own; /* the second is freed with it */
     int64_t missing;      /* samples without a height */
@@ -141,14 +146,26 @@ static double rim_weight(tl_window place, int64_t x, int64_t y)
     return rim >= FEATHER ? 1 : (double)(rim + 1) / (FEATHER + 1);
 }
 
-/* The member's own window for a part of its place. */
-static tl_window own_window(const dem_placement *p, tl_window part)
+/* Where a member lies at the canvas's level; at coarser ones members begin with a cell. */
+static tl_window place_on(const canvas *c, const dem_placement *p)
 {
-    tl_window own = {part.x - p->place.x, part.y - p->place.y, part.width, part.height};
+    tl_window place = p->place;
+    int64_t right = place.x + place.width - 1, bottom = place.y + place.height - 1;
+    place.x >>= c->halvings;
+    place.y >>= c->halvings;
+    place.width = (right >> c->halvings) - place.x + 1;
+    place.height = (bottom >> c->halvings) - place.y + 1;
+    return place;
+}
+
+/* The member's own window for a part of its place. */
+static tl_window own_window(const dem_placement *p, tl_window place, tl_window part)
+{
+    tl_window own = {part.x - place.x, part.y - place.y, part.width, part.height};
     if (p->mirror_x)
-        own.x = p->place.width - own.x - own.width;
+        own.x = place.width - own.x - own.width;
     if (p->mirror_y)
-        own.y = p->place.height - own.y - own.height;
+        own.y = place.height - own.y - own.height;
     return own;
 }
 
@@ -174,8 +191,8 @@ static int64_t count_voids(const float *heights, int64_t count)
 
 static tl_status paste_member(canvas *c, const dem_placement *p, tl_error *error)
 {
-    tl_window part = dem_window_common(p->place, c->window);
-    if (!wants(c, part))
+    tl_window place = place_on(c, p), part = dem_window_common(place, c->window);
+    if (dem_window_empty(part) || !wants(c, part))
         return TL_OK;
     bool direct =
         !c->mixes && !p->mirror_x && !p->mirror_y && c->missing == area_of(part) && area_of(part) == area_of(c->window);
@@ -183,7 +200,8 @@ static tl_status paste_member(canvas *c, const dem_placement *p, tl_error *error
         c->part = tl_alloc_grid(c->window.width, c->window.height, sizeof *c->part);
     if (!direct && !c->part)
         return tl_fail_memory(error, c->owner->name);
-    tl_status status = tl_source_read(p->source, 0, own_window(p, part), direct ? c->heights : c->part, error);
+    tl_status status =
+        tl_source_read(p->source, -c->halvings, own_window(p, place, part), direct ? c->heights : c->part, error);
     if (status != TL_OK)
         return status;
     if (direct)
@@ -193,9 +211,16 @@ static tl_status paste_member(canvas *c, const dem_placement *p, tl_error *error
     return TL_OK;
 }
 
+/* The samples of the finest level under a window. */
+static tl_window at_finest(const canvas *c, tl_window window)
+{
+    return (tl_window){window.x << c->halvings, window.y << c->halvings, window.width << c->halvings,
+                       window.height << c->halvings};
+}
+
 static tl_status paste_layer(canvas *c, const dem_layer *layer, tl_error *error)
 {
-    if (!dem_bins_find(layer->bins, c->window, &c->hits))
+    if (!dem_bins_find(layer->bins, at_finest(c, c->window), &c->hits))
         return tl_fail_memory(error, c->owner->name);
     for (size_t k = 0; k < c->hits.count && (c->mixes || c->missing); k++) {
         tl_status status = paste_member(c, &layer->placements[c->hits.numbers[k]], error);
@@ -374,13 +399,19 @@ static tl_status fill_block(canvas *c, tl_error *error)
 
 /* ---- Reading ---- */
 
-static tl_status read_block(const mosaic *m, tl_window block, float *out, int64_t stride, tl_error *error)
+typedef struct reading {
+    const mosaic *mosaic;
+    int halvings; /* of the level that is put together */
+} reading;
+
+static tl_status read_block(const reading *r, tl_window block, float *out, int64_t stride, tl_error *error)
 {
     canvas c;
     bool dense = block.width == stride || block.height == 1;
-    tl_status status = canvas_init(&c, m, block, dense ? out : NULL, error);
+    tl_status status = canvas_init(&c, r->mosaic, block, dense ? out : NULL, error);
     if (status != TL_OK)
         return status;
+    c.halvings = r->halvings;
     status = fill_block(&c, error);
     settle(&c);
     for (int64_t row = 0; row < block.height && status == TL_OK && !dense; row++)
@@ -389,7 +420,7 @@ static tl_status read_block(const mosaic *m, tl_window block, float *out, int64_
     return status;
 }
 
-static tl_status read_finest(const void *context, tl_window window, float *out, tl_error *error)
+static tl_status read_blocks(const void *context, tl_window window, float *out, tl_error *error)
 {
     int64_t columns = tl_int64_min(window.width, BLOCK_COLUMNS);
     int64_t rows = columns ? BLOCK_SAMPLES / columns : 1;
@@ -407,13 +438,16 @@ static tl_status read_finest(const void *context, tl_window window, float *out, 
 static tl_status mosaic_read(const tl_source *self, int level, tl_window window, float *out, tl_error *error)
 {
     const tl_source_info *info = &self->info;
-    dem_level_base base = {.read = read_finest,
-                           .context = self,
-                           .width = info->width,
-                           .height = info->height,
+    reading r = {.mosaic = (const mosaic *)self, .halvings = -level};
+    while (r.halvings > 0 && !(r.mosaic->reduced >> r.halvings & 1))
+        r.halvings--;
+    dem_level_base base = {.read = read_blocks,
+                           .context = &r,
+                           .width = ((info->width - 1) >> r.halvings) + 1,
+                           .height = ((info->height - 1) >> r.halvings) + 1,
                            .type = info->type,
                            .name = info->name};
-    return dem_level_read(&base, -level, window, out, error);
+    return dem_level_read(&base, -level - r.halvings, window, out, error);
 }
 
 /* ---- Making ---- */
@@ -481,6 +515,22 @@ static tl_status note_places(mosaic *m, size_t count, tl_error *error)
     return TL_OK;
 }
 
+/* Levels that all members have copies of, and begin with a cell of. */
+static uint64_t reduced_levels(const mosaic *m)
+{
+    const dem_layer *own = &m->plan.layers[0];
+    uint64_t levels = m->plan.count == 1 && !m->feather ? UINT64_MAX : 0;
+    for (size_t k = 0; k < own->count && levels; k++) {
+        const dem_placement *p = &own->placements[k];
+        uint64_t x = (uint64_t)p->place.x, y = (uint64_t)p->place.y;
+        levels &= p->mirror_x || p->mirror_y ? 0 : dem_raster_reduced(p->source);
+        for (int halvings = 1; halvings < 63; halvings++)
+            if ((x | y) & ((UINT64_C(1) << halvings) - 1))
+                levels &= ~(UINT64_C(1) << halvings);
+    }
+    return levels;
+}
+
 static tl_status assemble(mosaic *m, tl_source **members, size_t count, const char *name, tl_error *error)
 {
     m->name = strdup(name);
@@ -493,6 +543,7 @@ static tl_status assemble(mosaic *m, tl_source **members, size_t count, const ch
         return status;
     m->members = members;
     m->count = count;
+    m->reduced = reduced_levels(m);
     return describe(m, error);
 }
 

@@ -231,6 +231,16 @@ tl_source *dem_raster_create(dem_file *file, const dem_sharing *sharing, const t
     return NULL;
 }
 
+uint64_t dem_raster_reduced(const tl_source *source)
+{
+    uint64_t levels = 0;
+    const dem_source *dem = (const dem_source *)source;
+    for (unsigned k = 0; source->read == dem_read && k < dem->usable; k++)
+        if (dem->overviews[k].halvings > 0 && dem->overviews[k].halvings < 64)
+            levels |= UINT64_C(1) << dem->overviews[k].halvings;
+    return levels;
+}
+
 bool dem_raster_details(const tl_source *source, tl_dem_details *out)
 {
     if (source->read != dem_read)

@@ -32,6 +32,10 @@ tl_source *dem_hgt_create(dem_file *file, const dem_sharing *sharing, tl_error *
 /* Whether a name ends as those of .hgt files do. */
 bool dem_hgt_named(const char *path);
 
+/* Levels that a GeoTIFF holds reduced copies of and reads them from: bit k is set for level -k, k >= 1. 0 for others.
+ */
+uint64_t dem_raster_reduced(const tl_source *source);
+
 /* Details of a source of that kind; false for others. */
 bool dem_raster_details(const tl_source *source, tl_dem_details *out);
 bool dem_hgt_details(const tl_source *source, tl_dem_details *out);

@@ -1075,6 +1075,61 @@ static void reducedCopiesServeForLevelsTheyFit(void **state)
     tl_source_destroy(source);
 }
 
+static void reducedCopiesOfAllFilesServeForAMosaic(void **state)
+{
+    (void)state;
+    tile t = {.dx = 1, .dy = 1, .width = 32, .height = 24, .world = one};
+    add_tile(&t);
+    t.x = 32;
+    add_tile(&t);
+    for (int k = 0; k < 2; k++) {
+        add_overview(files[k], 16, 12, (float)(2 + k));
+        add_overview(files[k], 8, 6, (float)(4 + k));
+    }
+    add_overview(files[0], 4, 3, 6); /* the other has none of these */
+    tl_source *source = open_files(NULL);
+    float row[32];
+    read_level(source, -1, (tl_window){0, 11, 32, 1}, row);
+    for (int k = 0; k < 32; k++)
+        assert_true(row[k] == (k < 16 ? 2 : 3));
+    read_level(source, -2, (tl_window){0, 5, 16, 1}, row);
+    for (int k = 0; k < 16; k++)
+        assert_true(row[k] == (k < 8 ? 4 : 5));
+    read_level(source, -4, (tl_window){0, 1, 4, 1}, row); /* made of level -2 */
+    for (int k = 0; k < 4; k++)
+        assert_true(row[k] == (k < 2 ? 4 : 5));
+    tl_source_destroy(source);
+    source = open_files(&(tl_dem_options){.exact_levels = true});
+    check_levels(source);
+    tl_source_destroy(source);
+    source = open_files(&(tl_dem_options){.feather = true});
+    assert_true(first_of_level(source, -1) == 1);
+    tl_source_destroy(source);
+}
+
+/* Cells of a file that begins within one of the mosaic's are not the mosaic's; gaps are no matter. */
+static void reducedCopiesServeWhereTheirCellsAreTheMosaics(void **state)
+{
+    (void)state;
+    tile t = {.dx = 1, .dy = 1, .width = 30, .height = 24, .world = one};
+    add_tile(&t);
+    t.x = 34;
+    add_tile(&t);
+    for (int k = 0; k < 2; k++) {
+        add_overview(files[k], 15, 12, (float)(2 + k));
+        add_overview(files[k], 8, 6, (float)(4 + k));
+    }
+    tl_source *source = open_files(NULL); /* 34 is no multiple of 4 */
+    float row[32];
+    read_level(source, -1, (tl_window){0, 3, 32, 1}, row);
+    for (int k = 0; k < 32; k++)
+        assert_true(k < 15 ? row[k] == 2 : k < 17 ? isnan(row[k]) : row[k] == 3);
+    read_level(source, -2, (tl_window){0, 3, 16, 1}, row);
+    for (int k = 0; k < 16; k++)
+        assert_true(k < 8 ? row[k] == 2 : row[k] == 3);
+    tl_source_destroy(source);
+}
+
 static int make_folder(void **state)
 {
     (void)state;
@@ -1122,6 +1177,8 @@ int main(void)
         TEST(coarserLevelsArePointsOrMeans),
         TEST(mosaicsAndHgtFilesHaveLevelsToo),
         TEST(reducedCopiesServeForLevelsTheyFit),
+        TEST(reducedCopiesOfAllFilesServeForAMosaic),
+        TEST(reducedCopiesServeWhereTheirCellsAreTheMosaics),
     };
     return cmocka_run_group_tests(tests, make_folder, remove_folder);
 }

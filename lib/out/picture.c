@@ -1,6 +1,7 @@
 /* Pictures as PNG files. */
 #include "lib/base/error.h"
 #include "lib/base/parallel.h"
+#include "lib/base/size.h"
 #include "lib/out/png_encoder.h"
 #include "lib/scene/north_up.h"
 #include "lib/scene/render.h"
@@ -45,16 +46,22 @@ static tl_status write_picture(const scene_picture *picture, tl_output *output, 
 {
     enum { BAND = 64 };
     out_png encoder = {0};
+    unsigned char *made = picture->rgba ? NULL : tl_alloc_grid(picture->width, BAND, 4);
+    if (!picture->rgba && !made)
+        return tl_fail_memory(error, tl_output_path(output));
     tl_status status = out_png_begin(&encoder, output, OUT_PNG_RGBA8, picture->width, picture->height);
     for (int64_t y = 0; y < picture->height && status == TL_OK; y += BAND) {
         int64_t rows = picture->height - y < BAND ? picture->height - y : BAND;
         status = tl_run_check(run, &encoder.error);
+        if (status == TL_OK && made)
+            status = picture->rows(picture->context, y, rows, made, &encoder.error);
         if (status == TL_OK)
-            status = out_png_rows(&encoder, picture->rgba + y * picture->width * 4, rows);
+            status = out_png_rows(&encoder, made ? made : picture->rgba + y * picture->width * 4, rows);
     }
     if (status == TL_OK)
         status = out_png_end(&encoder);
     out_png_finish(&encoder);
+    free(made);
     if (status != TL_OK && error)
         *error = encoder.error;
     return status;

@@ -20,13 +20,21 @@ enum {
 
 /* ---- picture ---- */
 
-tl_status scene_picture_init(scene_picture *picture, int64_t width, int64_t height, tl_error *error)
+tl_status scene_picture_check(int64_t width, int64_t height, tl_error *error)
 {
     if (width > SCENE_PICTURE_MAX || height > SCENE_PICTURE_MAX)
         return tl_fail(
             error, TL_ERROR_ARGUMENT,
             "the picture would have %lld x %lld pixels, and %d on a side are the most; ask for a smaller one",
             (long long)width, (long long)height, SCENE_PICTURE_MAX);
+    return TL_OK;
+}
+
+tl_status scene_picture_init(scene_picture *picture, int64_t width, int64_t height, tl_error *error)
+{
+    tl_status status = scene_picture_check(width, height, error);
+    if (status != TL_OK)
+        return status;
     *picture = (scene_picture){.width = width, .height = height};
     picture->rgba = tl_alloc_grid(width, height, 4);
     if (!picture->rgba)
@@ -38,7 +46,9 @@ tl_status scene_picture_init(scene_picture *picture, int64_t width, int64_t heig
 void scene_picture_finish(scene_picture *picture)
 {
     free(picture->rgba);
-    picture->rgba = NULL;
+    if (picture->finish)
+        picture->finish(picture->context);
+    *picture = (scene_picture){0};
 }
 
 bool scene_has_sea_level(const tl_georef *georef)
@@ -143,14 +153,23 @@ static bool meets(const scene_axis *axis, int64_t samples)
 
 /* ---- shading ---- */
 
+/* One raster or two beside each other, and all that rows of their picture are made of. */
 typedef struct shading {
-    const scene_raster *raster;
-    const scene_palette *palette;
-    const scene_light *light;
-    double metres; /* exaggerated metres a pixel: one unit of height / the pixel */
-    scene_picture *picture;
-    int64_t left; /* first column in the picture */
+    int count;
+    scene_raster rasters[2];
+    double metres[2]; /* exaggerated metres a pixel: one unit of height / the pixel */
+    int64_t width;    /* of the whole picture */
+    scene_palette palette;
+    scene_light light;
+    tl_run run;
 } shading;
+
+/* A band of rows of the picture. */
+typedef struct band {
+    const shading *shading;
+    int64_t y;
+    unsigned char *rgba;
+} band;
 
 /* Slope between the neighbours of pixel p along one direction, whichever of them are there; units of height a pixel. */
 static double difference(const float *heights, size_t p, ptrdiff_t stride, bool before, bool after)
@@ -163,20 +182,21 @@ static double difference(const float *heights, size_t p, ptrdiff_t stride, bool 
     return !isnan(high) ? high - here : !isnan(low) ? here - low : 0;
 }
 
-static void shade_pixel(const shading *s, int64_t x, int64_t y, unsigned char *rgba)
+static void shade_pixel(const shading *s, int raster, int64_t x, int64_t y, unsigned char *rgba)
 {
-    const scene_raster *r = s->raster;
+    const scene_raster *r = &s->rasters[raster];
+    double metres = s->metres[raster];
     size_t p = (size_t)(y * r->width + x);
     float height = r->heights[p];
     if (isnan(height))
         return;
-    double east = difference(r->heights, p, 1, x > 0, x + 1 < r->width) * s->metres;
-    double south = difference(r->heights, p, r->width, y > 0, y + 1 < r->height) * s->metres;
-    scene_rgb c = scene_lit(s->light, scene_palette_at(s->palette, height), (float)east, (float)-south, 1);
+    double east = difference(r->heights, p, 1, x > 0, x + 1 < r->width) * metres;
+    double south = difference(r->heights, p, r->width, y > 0, y + 1 < r->height) * metres;
+    scene_rgb c = scene_lit(&s->light, scene_palette_at(&s->palette, height), (float)east, (float)-south, 1);
     rgba[0] = scene_encode(c.r);
     rgba[1] = scene_encode(c.g);
     rgba[2] = scene_encode(c.b);
-    rgba[3] = (unsigned char)(r->coverage[p] * 255 + 0.5f);
+    rgba[3] = r->coverage[p];
 }
 
 static tl_status shade_row(void *context, tl_parallel *loop, uint64_t item, unsigned worker, tl_error *error)
@@ -184,12 +204,31 @@ static tl_status shade_row(void *context, tl_parallel *loop, uint64_t item, unsi
     (void)loop;
     (void)worker;
     (void)error;
-    const shading *s = context;
-    int64_t y = (int64_t)item;
-    unsigned char *row = s->picture->rgba + (y * s->picture->width + s->left) * 4;
-    for (int64_t x = 0; x < s->raster->width; x++)
-        shade_pixel(s, x, y, row + 4 * x);
+    const band *b = context;
+    const shading *s = b->shading;
+    unsigned char *row = b->rgba + (int64_t)item * s->width * 4;
+    memset(row, 0, (size_t)s->width * 4);
+    for (int i = 0; i < s->count; i++) {
+        int64_t width = s->rasters[i].width, left = i * (width + GAP);
+        for (int64_t x = 0; x < width; x++)
+            shade_pixel(s, i, x, b->y + (int64_t)item, row + 4 * (left + x));
+    }
     return TL_OK;
+}
+
+static tl_status shade_rows(void *context, int64_t y, int64_t count, unsigned char *rgba, tl_error *error)
+{
+    const shading *s = context;
+    band b = {s, y, rgba};
+    return tl_parallel_for(&s->run, (uint64_t)count, 0, shade_row, &b, error);
+}
+
+static void shading_destroy(void *context)
+{
+    shading *s = context;
+    for (int i = 0; i < s->count; i++)
+        scene_raster_finish(&s->rasters[i]);
+    free(s);
 }
 
 static void pick(const scene_raster *raster, size_t count, float *out)
@@ -220,50 +259,32 @@ static tl_run quiet(const tl_run *run)
     return result;
 }
 
-static tl_status shade(const tl_source *const *sources, const scene_raster *rasters, int count, const frame *f,
-                       const tl_preview_options *options, scene_picture *picture, tl_error *error)
+static void prepare(shading *s, const tl_source *const *sources, const frame *f, const tl_preview_options *options)
 {
-    scene_palette *palette = malloc(sizeof *palette);
-    scene_light light;
-    if (!palette)
-        return tl_fail_memory(error, "the picture");
     bool given = options->sun_azimuth != 0 || options->sun_elevation != 0;
-    scene_light_init(&light, given ? options->sun_azimuth : 315, given ? options->sun_elevation : 45);
+    double exaggeration = options->exaggeration != 0 ? options->exaggeration : 1;
+    scene_light_init(&s->light, given ? options->sun_azimuth : 315, given ? options->sun_elevation : 45);
     scene_encode_prepare();
-    const tl_georef *georef = &sources[0]->info.georef;
-    tl_run run = quiet(options->run); /* the work was in the reading */
-    tl_status status = palette_init(palette, rasters, count, options->grey, scene_has_sea_level(georef), error);
-    for (int i = 0; i < count && status == TL_OK; i++) {
-        double exaggeration = options->exaggeration != 0 ? options->exaggeration : 1;
-        shading s = {.raster = &rasters[i], .palette = palette, .light = &light, .picture = picture};
-        s.metres = sources[i]->info.georef.height_unit * exaggeration / f->pixel;
-        s.left = i * (f->width + GAP);
-        status = tl_parallel_for(&run, (uint64_t)f->height, 0, shade_row, &s, error);
-    }
-    free(palette);
-    return status;
+    s->run = quiet(options->run); /* the work was in the reading */
+    for (int i = 0; i < s->count; i++)
+        s->metres[i] = sources[i]->info.georef.height_unit * exaggeration / f->pixel;
 }
 
-static tl_status draw(const tl_source *const *sources, int count, const frame *f, const tl_preview_options *options,
-                      scene_picture *picture, tl_error *error)
+static tl_status resample(shading *s, const tl_source *const *sources, const frame *f, const tl_run *run,
+                          tl_error *error)
 {
-    scene_raster rasters[2] = {{0}};
     tl_status status = TL_OK;
-    for (int i = 0; i < count && status == TL_OK; i++) {
+    for (int i = 0; i < s->count && status == TL_OK; i++) {
         const tl_source_info *a = &sources[0]->info, *b = &sources[i]->info;
         scene_axis x = i ? axis_beside(&f->x, a, b, true) : f->x, y = i ? axis_beside(&f->y, a, b, false) : f->y;
         if (!meets(&x, b->width) || !meets(&y, b->height))
             status = tl_fail(error, TL_ERROR_ARGUMENT, "%s: does not cover the middle of %s; name rasters of one place",
                              b->name, a->name);
         if (status == TL_OK)
-            status = scene_raster_init(&rasters[i], f->width, f->height, error);
+            status = scene_raster_init(&s->rasters[i], f->width, f->height, error);
         if (status == TL_OK)
-            status = scene_resample(sources[i], &x, &y, options->run, &rasters[i], error);
+            status = scene_resample(sources[i], &x, &y, run, &s->rasters[i], error);
     }
-    if (status == TL_OK)
-        status = shade(sources, rasters, count, f, options, picture, error);
-    for (int i = 0; i < count; i++)
-        scene_raster_finish(&rasters[i]);
     return status;
 }
 
@@ -276,10 +297,24 @@ tl_status scene_hillshade(const tl_source *source, const tl_source *beside, cons
         return tl_fail(error, TL_ERROR_ARGUMENT, "a picture of two needs a width of at least %d pixels", GAP + 2);
     frame f = beside ? frame_of_two(info, &beside->info, options->width, options->height)
                      : frame_of(info, pixel_of(info, options->width, options->height), options->width, options->height);
-    tl_status status = scene_picture_init(picture, beside ? 2 * f.width + GAP : f.width, f.height, error);
-    if (status == TL_OK)
-        status = draw(sources, beside ? 2 : 1, &f, options, picture, error);
+    int64_t width = beside ? 2 * f.width + GAP : f.width;
+    tl_status status = scene_picture_check(width, f.height, error);
     if (status != TL_OK)
-        scene_picture_finish(picture);
+        return status;
+    shading *s = calloc(1, sizeof *s);
+    if (!s)
+        return tl_fail_memory(error, "the picture");
+    s->count = beside ? 2 : 1;
+    s->width = width;
+    prepare(s, sources, &f, options);
+    status = resample(s, sources, &f, options->run, error);
+    if (status == TL_OK)
+        status =
+            palette_init(&s->palette, s->rasters, s->count, options->grey, scene_has_sea_level(&info->georef), error);
+    if (status == TL_OK)
+        *picture = (scene_picture){
+            .width = width, .height = f.height, .context = s, .rows = shade_rows, .finish = shading_destroy};
+    else
+        shading_destroy(s);
     return status;
 }

@@ -79,9 +79,23 @@ static tl_status north_up_validity(const tl_source *self, int level, tl_window w
     return status;
 }
 
+/* Coarser levels count from the original's first sample: turned round, they are those of this source only where the
+ * last cell is a whole one, or the last sample one of theirs. */
+static bool ends_alike(const tl_source_info *info, int64_t samples, int halvings)
+{
+    int64_t last = info->type == TL_RASTER_POINT ? samples - 1 : samples;
+    return halvings >= 0 && halvings < 63 && (last & ((INT64_C(1) << halvings) - 1)) == 0;
+}
+
 static tl_status north_up_size(const tl_source *self, int level, int64_t *width, int64_t *height, tl_error *error)
 {
-    return tl_source_size(((const north_up *)self)->original, level, width, height, error);
+    const north_up *n = (const north_up *)self;
+    const tl_source_info *info = &self->info;
+    int halvings = info->level - level;
+    if ((n->columns && !ends_alike(info, info->width, halvings)) ||
+        (n->rows && !ends_alike(info, info->height, halvings)))
+        return tl_fail(error, TL_ERROR_ARGUMENT, "%s: has no level %d with the north on top", info->name, level);
+    return tl_source_size(n->original, level, width, height, error);
 }
 
 static void north_up_destroy(tl_source *self)

@@ -6,12 +6,17 @@
 
 enum { SCENE_PICTURE_MAX = 32768 }; /* pixels on a side */
 
-/* 8-bit sRGB with straight alpha, row by row from the top, 4 bytes a pixel. */
+/* 8-bit sRGB with straight alpha, row by row from the top, 4 bytes a pixel: all of them in `rgba`, or made in bands of
+ * rows as they are asked for. */
 typedef struct scene_picture {
     int64_t width, height;
-    unsigned char *rgba;
+    unsigned char *rgba; /* NULL: made by `rows` */
+    void *context;
+    tl_status (*rows)(void *context, int64_t y, int64_t count, unsigned char *rgba, tl_error *error);
+    void (*finish)(void *context);
 } scene_picture;
 
+tl_status scene_picture_check(int64_t width, int64_t height, tl_error *error);
 /* Allocates a transparent picture; refuses sizes above SCENE_PICTURE_MAX. */
 tl_status scene_picture_init(scene_picture *picture, int64_t width, int64_t height, tl_error *error);
 void scene_picture_finish(scene_picture *picture);

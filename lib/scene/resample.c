@@ -28,7 +28,8 @@ void scene_raster_finish(scene_raster *raster)
 {
     free(raster->heights);
     free(raster->coverage);
-    raster->heights = raster->coverage = NULL;
+    raster->heights = NULL;
+    raster->coverage = NULL;
 }
 
 /* ---- weights of samples in pixels ---- */
@@ -152,6 +153,7 @@ static tl_status kernel_init(kernel *k, const scene_axis *axis, int64_t samples,
 
 typedef struct resampling {
     const tl_source *source;
+    int level;
     scene_raster *raster;
     kernel smooth[2], safe[2]; /* x and y; `safe` has no negative weights */
     double sharpness[2];       /* pixels a sample, at least 1 */
@@ -235,7 +237,7 @@ static void sum_columns(const kernel *k, const block *b, tl_window window, doubl
 
 static tl_status add_window(const resampling *r, block *b, tl_window window, tl_error *error)
 {
-    tl_status status = tl_source_read(r->source, r->source->info.level, window, b->heights, error);
+    tl_status status = tl_source_read(r->source, r->level, window, b->heights, error);
     if (status != TL_OK)
         return status;
     size_t pixels = (size_t)(b->pixels.width * b->pixels.height), samples = (size_t)(window.width * window.height);
@@ -303,7 +305,7 @@ static void conclude(const resampling *r, const block *b)
             }
             float coverage = coverage_of(r, weight);
             r->raster->heights[at] = inside && coverage > 0 ? (float)height : NAN;
-            r->raster->coverage[at] = inside && !isnan(height) ? coverage : 0;
+            r->raster->coverage[at] = inside && !isnan(height) ? (unsigned char)(coverage * 255 + 0.5f) : 0;
         }
 }
 
@@ -333,12 +335,36 @@ static int64_t block_pixels(double step)
     return pixels < 1 ? 1 : pixels > BLOCK_PIXELS ? BLOCK_PIXELS : (int64_t)pixels;
 }
 
+/* The coarsest level that the pixels can be made of: they are to have two of its samples each way at least, so that the
+ * mean of some is still one over the pixel. Levels of points are no means. */
+static int coarsest_level(const tl_source *source, const scene_axis *x, const scene_axis *y, int64_t samples[2])
+{
+    double step = fmin(x->step, y->step);
+    int level = source->info.level;
+    samples[0] = source->info.width;
+    samples[1] = source->info.height;
+    for (int halvings = 1; source->info.type == TL_RASTER_AREA && halvings < 62 && ldexp(step, -halvings) >= 2;
+         halvings++)
+        if (tl_source_size(source, source->info.level - halvings, &samples[0], &samples[1], NULL) == TL_OK)
+            level = source->info.level - halvings;
+        else
+            break;
+    return level;
+}
+
+/* The same pixels in samples of a coarser level, whose first cell begins where the first sample's does. */
+static scene_axis at_level(const scene_axis *axis, int halvings)
+{
+    return (scene_axis){ldexp(axis->origin + 0.5, -halvings) - 0.5, ldexp(axis->step, -halvings), axis->pixels};
+}
+
 tl_status scene_resample(const tl_source *source, const scene_axis *x, const scene_axis *y, const tl_run *run,
                          scene_raster *raster, tl_error *error)
 {
-    const scene_axis *axes[2] = {x, y};
-    const int64_t samples[2] = {source->info.width, source->info.height};
-    resampling r = {.source = source, .raster = raster};
+    int64_t samples[2];
+    resampling r = {.source = source, .raster = raster, .level = coarsest_level(source, x, y, samples)};
+    const scene_axis coarse[2] = {at_level(x, source->info.level - r.level), at_level(y, source->info.level - r.level)};
+    const scene_axis *axes[2] = {&coarse[0], &coarse[1]};
     tl_status status = TL_OK;
     for (int a = 0; a < 2; a++) {
         r.sharpness[a] = axes[a]->step < 1 ? 1 / axes[a]->step : 1;
@@ -348,12 +374,12 @@ tl_status scene_resample(const tl_source *source, const scene_axis *x, const sce
             status = kernel_init(&r.safe[a], axes[a], samples[a], false, error);
     }
     if (status == TL_OK) {
-        r.block_width = block_pixels(x->step);
-        r.block_height = block_pixels(y->step);
+        r.block_width = block_pixels(coarse[0].step);
+        r.block_height = block_pixels(coarse[1].step);
         r.columns = tl_div_up(x->pixels, r.block_width);
         uint64_t blocks = (uint64_t)(r.columns * tl_div_up(y->pixels, r.block_height));
-        uint64_t work = (uint64_t)(fmin((double)samples[0], x->step * (double)x->pixels) *
-                                   fmin((double)samples[1], y->step * (double)y->pixels));
+        uint64_t work = (uint64_t)(fmin((double)samples[0], coarse[0].step * (double)x->pixels) *
+                                   fmin((double)samples[1], coarse[1].step * (double)y->pixels));
         status = tl_parallel_for(run, blocks, work, resample_block, &r, error);
     }
     for (int a = 0; a < 2; a++) {

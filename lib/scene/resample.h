@@ -10,20 +10,22 @@ typedef struct scene_axis {
     int64_t pixels;
 } scene_axis;
 
-/* A picture's heights. A pixel that no valid sample reaches is NaN; `coverage` is the part of a pixel (0 ... 1) that
+/* A picture's heights. A pixel that no valid sample reaches is NaN; `coverage` is the part of a pixel (0 ... 255) that
  * valid samples fill. */
 typedef struct scene_raster {
     int64_t width, height;
-    float *heights, *coverage;
+    float *heights;
+    unsigned char *coverage;
 } scene_raster;
 
 tl_status scene_raster_init(scene_raster *raster, int64_t width, int64_t height, tl_error *error);
 void scene_raster_finish(scene_raster *raster);
 
-/* Fills raster (of x->pixels by y->pixels) from the finest level of `source`. Where pixels are larger than samples, by
- * the mean over the pixel's box; where they are smaller, by cubic interpolation (Catmull-Rom: it goes through the
- * samples and its slopes there are their central differences, so a shaded picture shows no cell borders). Both
- * reproduce planes. Pulls the source by windows, in parallel; memory does not depend on the source's size. */
+/* Fills raster (of x->pixels by y->pixels) from the finest level of `source`, or, where a pixel is four cells of an
+ * area raster and more, from the coarsest one that has two cells and more a pixel each way. Where pixels are larger
+ * than samples, by the mean over the pixel's box; where they are smaller, by cubic interpolation (Catmull-Rom: it goes
+ * through the samples and its slopes there are their central differences, so a shaded picture shows no cell borders).
+ * Both reproduce planes. Pulls the source by windows, in parallel; memory does not depend on the source's size. */
 tl_status scene_resample(const tl_source *source, const scene_axis *x, const scene_axis *y, const tl_run *run,
                          scene_raster *raster, tl_error *error);
 
