@@ -530,7 +530,8 @@ typedef struct tl_roughness {
     bool measurable; /* false: too small, too flat or too void to tell; the rest is then 0 */
     double sigma;    /* standard deviation of the detail of the finest octave, units of height */
     /* Exponent between the two finest octaves; above 1 on smooth hillslopes. The second octave is that of 2 x 2 means,
-     * as suits rasters of cell means; of a surface sampled at true points it reads 0.4 to 0.6 too low. */
+     * as suits rasters of cell means; of a surface sampled at true points it reads 0.4 to 0.6 too low. Of a raster
+     * that is too small to tell, the exponent that terrain as rough as this usually has. */
     double hurst;
 } tl_roughness;
 

@@ -291,7 +291,7 @@ static tl_status prepare(field *f, const tl_field_options *o, tl_error *error)
         status = scene_detail_measure(f->dem, o->run, &detail, error);
     if (status != TL_OK)
         return status;
-    tl_roughness measured = scene_roughness_of(&detail);
+    tl_roughness measured = scene_roughness_of(&detail, &f->dem->info.georef);
     scene_octave octaves[SCENE_LEVEL_MAX + 1];
     schedule(f, o, &measured, octaves);
     set_steps(f, o, octaves);

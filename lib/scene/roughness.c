@@ -74,19 +74,32 @@ static void add(fbm_detail *sum, const fbm_detail *part)
     sum->count += part->count;
 }
 
-tl_roughness scene_roughness_of(const scene_detail *detail)
+/* The exponent that real terrain has at this ratio of its finest detail to the cell: fbm/terrain.h's rule. */
+static double usual_hurst(double ratio)
+{
+    return 1.191 + .266 * (ratio + 5);
+}
+
+/* log2 of a standard deviation to the cell, metres to metres. */
+static double ratio_of(double sigma, const tl_georef *georef)
+{
+    return fbm_log2(sigma * georef->height_unit / sqrt(georef->cell_x * georef->cell_y));
+}
+
+tl_roughness scene_roughness_of(const scene_detail *detail, const tl_georef *georef)
 {
     const fbm_detail *octaves = detail->octaves;
     tl_roughness result = {0};
-    if (octaves[0].count < MIN_BLOCKS || octaves[1].count < MIN_BLOCKS)
+    if (octaves[0].count < MIN_BLOCKS)
         return result;
     double finest = sqrt(fbm_detail_variance(&octaves[0], 0, detail->noise)),
            next = sqrt(fbm_detail_variance(&octaves[1], 1, detail->noise));
-    if (!(finest > 0) || !(next > 0) || !isfinite(finest) || !isfinite(next))
+    bool both = octaves[1].count >= MIN_BLOCKS;
+    if (!(finest > 0) || !isfinite(finest) || (both && (!(next > 0) || !isfinite(next))))
         return result;
     result.measurable = true;
     result.sigma = finest;
-    result.hurst = fbm_log2(next / finest);
+    result.hurst = both ? fbm_log2(next / finest) : usual_hurst(ratio_of(finest, georef));
     return result;
 }
 
@@ -116,7 +129,7 @@ tl_status tl_roughness_measure(const tl_source *dem, const tl_run *run, tl_rough
     scene_detail detail;
     tl_status status = scene_detail_measure(dem, run, &detail, error);
     if (status == TL_OK)
-        *out = scene_roughness_of(&detail);
+        *out = scene_roughness_of(&detail, &dem->info.georef);
     return status;
 }
 
@@ -129,10 +142,9 @@ void scene_predict_octaves(const tl_roughness *measured, const tl_georef *georef
         return;
     }
     double hurst = measured->hurst, sigma = measured->sigma;
-    /* of the finest measured detail to the cell, metres to metres */
-    double ratio = fbm_log2(sigma * georef->height_unit / sqrt(georef->cell_x * georef->cell_y));
+    double ratio = ratio_of(sigma, georef);
     for (int j = 0; j < count; j++) {
-        hurst += .276 * (1.191 + .266 * (ratio + 5) - hurst);
+        hurst += .276 * (usual_hurst(ratio) - hurst);
         sigma *= fbm_exp2(-hurst);
         ratio += 1 - hurst;
         octaves[j] = (scene_octave){.sigma = sigma, .hurst = hurst};

@@ -13,7 +13,9 @@ typedef struct scene_detail {
 
 /* Reads the raster once. */
 tl_status scene_detail_measure(const tl_source *dem, const tl_run *run, scene_detail *out, tl_error *error);
-tl_roughness scene_roughness_of(const scene_detail *detail);
+/* Its roughness; the exponent of a raster that is too small for a second octave is the usual one of terrain as rough.
+ */
+tl_roughness scene_roughness_of(const scene_detail *detail, const tl_georef *georef);
 
 /* The detail of one octave below the samples. */
 typedef struct scene_octave {

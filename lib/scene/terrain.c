@@ -577,7 +577,7 @@ static tl_status calibrate(survey *s, const scene_detail *detail, const scene_oc
                            const tl_run *run, tl_error *error)
 {
     const tl_georef *g = &s->dem->info.georef;
-    double log_aspect = fbm_log2(g->cell_x / g->cell_y), hurst = scene_roughness_of(detail).hurst;
+    double log_aspect = fbm_log2(g->cell_x / g->cell_y), hurst = scene_roughness_of(detail, g).hurst;
     double excess = 0, means[CALIBRATED];
     if (s->shares[0] > 0 && s->shares[1] > 0)
         excess = fbm_log2(s->shares[0] / s->shares[1]) - 2 * (.70 + .815 * hurst) * log_aspect;
