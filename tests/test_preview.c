@@ -392,11 +392,69 @@ static void resamplingTakesMeansOfValidSamples(void **state)
                 count += !isnan(z);
             }
             assert_true(fabs((double)raster.heights[y * PIXELS + x] - sum / count) < 1e-6);
-            assert_true(fabs((double)raster.coverage[y * PIXELS + x] - count / (STEP * STEP)) < 1e-6);
+            assert_true(fabs((double)raster.coverage[y * PIXELS + x] / 255 - count / (STEP * STEP)) < 0.5001 / 255);
         }
     scene_raster_finish(&raster);
     tl_source_destroy(source);
     free(heights);
+}
+
+/* Holds two coarser levels, and remembers the finest one that was read. */
+typedef struct layered {
+    tl_source source;
+    int finest_read;
+} layered;
+
+static tl_status layered_size(const tl_source *self, int level, int64_t *width, int64_t *height, tl_error *error)
+{
+    (void)error;
+    if (level < -2 || level > 0)
+        return TL_ERROR_ARGUMENT;
+    *width = ((self->info.width - 1) >> -level) + 1;
+    *height = ((self->info.height - 1) >> -level) + 1;
+    return TL_OK;
+}
+
+/* A plane, so that means are the plane at cells' middles. */
+static tl_status layered_read(const tl_source *self, int level, tl_window window, float *out, tl_error *error)
+{
+    (void)error;
+    layered *l = (layered *)self;
+    double size = ldexp(1, -level);
+    l->finest_read = level > l->finest_read ? level : l->finest_read;
+    for (int64_t k = 0; k < window.width * window.height; k++) {
+        double x = ((double)(window.x + k % window.width) + 0.5) * size - 0.5;
+        double y = ((double)(window.y + k / window.width) + 0.5) * size - 0.5;
+        out[k] = (float)(3 * x - 2 * y + 7);
+    }
+    return TL_OK;
+}
+
+static void largePixelsAreMadeFromCoarserLevels(void **state)
+{
+    (void)state;
+    const struct {
+        double step;
+        int level; /* that is read */
+        tl_raster_type type;
+    } cases[] = {{3.9, 0, TL_RASTER_AREA}, {4, -1, TL_RASTER_AREA},     {7.7, -1, TL_RASTER_AREA},
+                 {8, -2, TL_RASTER_AREA},  {100.3, -2, TL_RASTER_AREA}, {100.3, 0, TL_RASTER_POINT}};
+    for (size_t k = 0; k < sizeof cases / sizeof *cases; k++) {
+        layered l = {.source = {.info = {.width = 4096, .height = 4096, .type = cases[k].type, .name = "layered"},
+                                .read = layered_read,
+                                .size = layered_size},
+                     .finest_read = -100};
+        scene_axis axis = {cases[k].step, cases[k].step, 30};
+        scene_raster raster;
+        assert_int_equal(scene_raster_init(&raster, 30, 30, NULL), TL_OK);
+        assert_int_equal(scene_resample(&l.source, &axis, &axis, &(tl_run){.threads = 1}, &raster, NULL), TL_OK);
+        assert_int_equal(l.finest_read, cases[k].level);
+        for (int p = 0; cases[k].type == TL_RASTER_AREA && p < 900; p++) {
+            double x = axis.origin + axis.step * (p % 30), y = axis.origin + axis.step * (p / 30);
+            assert_true(fabs((double)raster.heights[p] - (3 * x - 2 * y + 7)) < 1e-3);
+        }
+        scene_raster_finish(&raster);
+    }
 }
 
 /* ---- z-buffer ---- */
@@ -712,6 +770,7 @@ int main(void)
         WITH_FOLDER(besideShowsTheSameGround),
         WITH_FOLDER(besideRefusesAnotherPlace),
         cmocka_unit_test(resamplingTakesMeansOfValidSamples),
+        cmocka_unit_test(largePixelsAreMadeFromCoarserLevels),
         cmocka_unit_test(neighbouringTrianglesLeaveNoGap),
         cmocka_unit_test(cutTrianglesKeepTheirPlane),
         WITH_FOLDER(theTargetIsInTheMiddle),

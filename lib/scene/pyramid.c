@@ -7,7 +7,7 @@
 #include <math.h>
 #include <string.h>
 
-enum { BASE_CELLS = 4096, SQUARE_LOG = 11, TILE_LOG = 6 };
+enum { BASE_CELLS = 4096, SQUARE_LOG = 10, TILE_LOG = 6 };
 
 static int64_t vertices(int64_t samples, int step)
 {
@@ -260,7 +260,7 @@ tl_status scene_pyramid_init(scene_pyramid *pyramid, const tl_source *source, co
         pyramid->lattices[k].width = vertices(source->info.width, k);
         pyramid->lattices[k].height = vertices(source->info.height, k);
     }
-    /* read in squares of 2048 samples, whatever the raster's size, but of a cell of the base at least; bounds are those
+    /* read in squares of 1024 samples, whatever the raster's size, but of a cell of the base at least; bounds are those
      * of the base's tiles where a square holds such */
     pyramid->square = pyramid->base > SQUARE_LOG ? pyramid->base : SQUARE_LOG;
     pyramid->block = pyramid->base + TILE_LOG < pyramid->square ? pyramid->base + TILE_LOG : pyramid->square;
