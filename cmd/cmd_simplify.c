@@ -11,6 +11,7 @@ typedef struct settings {
     double max_error; /* asked for; or what a budget comes to */
     bool max_error_given, verify;
     int frame, mesh, borders;
+    double skirt, base;
     int64_t triangles, vertices; /* budgets; 0: none */
     const char *keep;
     double share; /* of the samples, by --keep; 0: none */
@@ -39,7 +40,15 @@ static int report_check(const settings *set, const tl_mesh_report *check)
     return EXIT_FAILED;
 }
 
-static int write_and_check(const settings *set, const tl_source *dem, const tl_mesh *mesh, const tl_run *run,
+/* What goes below the surface that was checked. */
+static tl_status add_below(const settings *set, tl_mesh *mesh, tl_error *error)
+{
+    if (set->skirt > 0)
+        return tl_mesh_add_skirt(mesh, set->skirt, error);
+    return set->base > 0 ? tl_mesh_add_base(mesh, set->base, error) : TL_OK;
+}
+
+static int write_and_check(const settings *set, const tl_source *dem, tl_mesh *mesh, const tl_run *run,
                            progress *bar)
 {
     tl_error error;
@@ -53,7 +62,7 @@ static int write_and_check(const settings *set, const tl_source *dem, const tl_m
         return status;
     progress_stage(bar, "writing");
     tl_write_options options = {.overwrite = set->common.overwrite, .frame = (tl_frame)set->frame, .run = run};
-    if (tl_write_mesh(mesh, set->common.output, &options, &error) != TL_OK)
+    if (add_below(set, mesh, &error) != TL_OK || tl_write_mesh(mesh, set->common.output, &options, &error) != TL_OK)
         return command_failed(bar, &error);
     progress_end(bar);
     return EXIT_DONE;
@@ -171,6 +180,8 @@ static bool settings_ok(settings *set)
         complain("--max-error, --budget, --budget-vertices and --keep exclude each other; give one");
     else if (!read_share(set))
         return false;
+    else if (set->skirt > 0 && set->base > 0)
+        complain("--skirt and --base exclude each other: a solid has walls already");
     else if (by_pyramid(set) && (set->mesh != TL_MESH_QUADTREE || set->borders != BORDERS_FREE))
         complain("--budget, --budget-vertices and --keep choose among quadtree meshes with free borders; leave "
                  "--mesh and --borders away");
@@ -196,6 +207,11 @@ static int run(const command *self, int argc, const char **argv, bool help)
          "canonical: by the rim's samples alone, so that tiles that share them join without a crack; a tin always has "
          "these (default: free)",
          0, 0, border_names},
+        {"skirt", 0, OPTION_NUMBER, &set.skirt, NULL, "DEPTH",
+         "hang walls this deep below the rim and the rims of voids, in the DEM's unit, 1e-6...1e30", 1e-6, 1e30, NULL},
+        {"base", 0, OPTION_NUMBER, &set.base, NULL, "THICKNESS",
+         "close the mesh to a solid with walls and a floor this far below its lowest point, 1e-6...1e30", 1e-6, 1e30,
+         NULL},
         {"verify", 0, OPTION_FLAG, &set.verify, NULL, NULL, "measure the finished mesh against every sample", 0, 0,
          NULL},
         {"frame", 0, OPTION_CHOICE, &set.frame, NULL, "FRAME",
@@ -218,7 +234,7 @@ static int run(const command *self, int argc, const char **argv, bool help)
 
 const command command_simplify = {
     "simplify", "simplify an elevation model to a mesh under a strict error bound", "DEM... --max-error E -o MESH",
-    "Formats: .glb, .obj, .ply. Frames: enu is metres east, north and up of the raster's middle;\n"
+    "Formats: .glb, .obj, .ply, .stl. Frames: enu is metres east, north and up of the raster's middle;\n"
     "projected is the DEM's own coordinates; pixel is column, row, height.\n\n" INPUT_NOTES "\n\n"
     "Example: talus simplify dem.tif --max-error 5 --verify -o mesh.glb",
     run};

@@ -378,6 +378,13 @@ typedef enum tl_frame {
  * of more than 2^31 samples are refused. */
 TL_API tl_status tl_mesh_from_source(const tl_source *source, const tl_run *run, tl_mesh **out, tl_error *error);
 
+/* Hangs a wall of `depth` units of height, > 0, below every open edge of a mesh: it hides cracks towards a neighbour of
+ * another detail. */
+TL_API tl_status tl_mesh_add_skirt(tl_mesh *mesh, double depth, tl_error *error);
+/* Closes a mesh to a solid with a floor `thickness` units of height, > 0, below its lowest vertex: every edge then has
+ * two triangles, and all face outwards. For 3-D printing. */
+TL_API tl_status tl_mesh_add_base(tl_mesh *mesh, double thickness, tl_error *error);
+
 /* What a rescan of a mesh against every sample of a grid finds. */
 typedef struct tl_mesh_report {
     double max_error; /* largest |mesh - sample|, in units of height */
@@ -584,7 +591,8 @@ typedef struct tl_write_options {
  * the output. The file appears under its name only when it is complete. */
 TL_API tl_status tl_write_grid(const tl_source *source, const char *path, const tl_write_options *options,
                                tl_error *error);
-/* Writes a mesh to `path` (GLB, OBJ or PLY by its ending). */
+/* Writes a mesh to `path` (GLB, OBJ, PLY or STL by its ending). An STL in map coordinates counts from a whole unit near
+ * its first vertex, which its header names: single precision is too coarse for them. */
 TL_API tl_status tl_write_mesh(const tl_mesh *mesh, const char *path, const tl_write_options *options, tl_error *error);
 
 /* ---- Pictures ---------------------------------------------------------------------------------- */

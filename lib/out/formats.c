@@ -24,7 +24,7 @@ static const struct writers {
     {"exr", true, out_exr_write, NULL, NULL},       {"tif", false, out_geotiff_write, NULL, NULL},
     {"tiff", false, out_geotiff_write, NULL, NULL}, {"png", true, NULL, NULL, out_png16_write},
     {"glb", false, NULL, out_gltf_write, NULL},     {"obj", false, NULL, out_obj_write, NULL},
-    {"ply", false, NULL, out_ply_write, NULL},
+    {"ply", false, NULL, out_ply_write, NULL},      {"stl", false, NULL, out_stl_write, NULL},
 };
 
 /* In the order of `writers`. A mesh format takes grids too: as their full mesh. */
@@ -36,6 +36,7 @@ static const tl_format formats[] = {
     {"glb", "glTF 2.0 binary mesh", true, true},
     {"obj", "Wavefront OBJ mesh", true, true},
     {"ply", "binary PLY mesh", true, true},
+    {"stl", "binary STL mesh, for 3-D printing", true, true},
     {NULL, NULL, false, false},
 };
 _Static_assert(sizeof formats / sizeof *formats == sizeof writers / sizeof *writers + 1, "one writer a format");
@@ -60,7 +61,7 @@ static const struct writers *writers_of(const char *path, tl_error *error)
 {
     const tl_format *format = tl_format_of(path);
     if (!format) {
-        tl_fail(error, TL_ERROR_ARGUMENT, "%s: no format has this ending; use one of exr, tif, png, glb, obj, ply",
+        tl_fail(error, TL_ERROR_ARGUMENT, "%s: no format has this ending; use one of exr, tif, png, glb, obj, ply, stl",
                 path);
         return NULL;
     }
@@ -86,7 +87,7 @@ tl_status tl_write_mesh(const tl_mesh *mesh, const char *path, const tl_write_op
     if (!format)
         return TL_ERROR_ARGUMENT;
     if (!format->mesh)
-        return tl_fail(error, TL_ERROR_ARGUMENT, "%s: .%s holds no meshes; use glb, obj or ply", path, format->ending);
+        return tl_fail(error, TL_ERROR_ARGUMENT, "%s: .%s holds no meshes; use glb, obj, ply or stl", path, format->ending);
     tl_output *output = tl_output_open(path, options->overwrite, error);
     if (!output)
         return TL_ERROR_IO;

@@ -17,6 +17,7 @@ tl_status out_validity_write(const tl_source *source, tl_output *output, const t
 tl_status out_gltf_write(const tl_mesh *mesh, tl_output *output, const tl_write_options *options, tl_error *error);
 tl_status out_obj_write(const tl_mesh *mesh, tl_output *output, const tl_write_options *options, tl_error *error);
 tl_status out_ply_write(const tl_mesh *mesh, tl_output *output, const tl_write_options *options, tl_error *error);
+tl_status out_stl_write(const tl_mesh *mesh, tl_output *output, const tl_write_options *options, tl_error *error);
 /* Two files, `path` and its JSON sidecar, so this one opens its own outputs. */
 tl_status out_png16_write(const tl_source *source, const char *path, const tl_write_options *options, tl_error *error);
 
