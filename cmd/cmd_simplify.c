@@ -85,10 +85,38 @@ static bool by_pyramid(const settings *set)
     return set->triangles || set->vertices || set->share > 0 || set->error_cache;
 }
 
+/* The pyramid from the cache, where it fits the DEM; *status tells why there is none. */
+static tl_pyramid *load_pyramid(const settings *set, const tl_source *dem, const tl_pyramid_options *options,
+                                tl_status *status, tl_error *error)
+{
+    struct stat there;
+    *status = TL_OK;
+    if (!set->error_cache || stat(set->error_cache, &there) != 0)
+        return NULL;
+    tl_pyramid *pyramid = tl_pyramid_load(set->error_cache, dem, options, error);
+    if (pyramid)
+        command_say(&set->common, "%s: error pyramid used again", set->error_cache);
+    else if (error->status == TL_ERROR_DATA)
+        command_say(&set->common, "%s; made again", error->text);
+    else
+        *status = error->status;
+    return pyramid;
+}
+
 static tl_pyramid *make_pyramid(const settings *set, const tl_source *dem, const tl_run *run, tl_error *error)
 {
     tl_pyramid_options options = {.frame = (tl_frame)set->frame, .run = run};
-    return tl_pyramid_create(dem, &options, error);
+    tl_write_options writing = {.overwrite = true, .run = run};
+    tl_status status;
+    tl_pyramid *pyramid = load_pyramid(set, dem, &options, &status, error);
+    if (pyramid || status != TL_OK)
+        return pyramid;
+    pyramid = tl_pyramid_create(dem, &options, error);
+    if (pyramid && set->error_cache && tl_pyramid_save(pyramid, set->error_cache, &writing, error) != TL_OK) {
+        tl_pyramid_destroy(pyramid);
+        return NULL;
+    }
+    return pyramid;
 }
 
 static tl_status select_mesh(settings *set, const tl_source *dem, const tl_run *run, tl_mesh **mesh, uint64_t *isolated,
@@ -183,8 +211,8 @@ static bool settings_ok(settings *set)
     else if (set->skirt > 0 && set->base > 0)
         complain("--skirt and --base exclude each other: a solid has walls already");
     else if (by_pyramid(set) && (set->mesh != TL_MESH_QUADTREE || set->borders != BORDERS_FREE))
-        complain("--budget, --budget-vertices and --keep choose among quadtree meshes with free borders; leave "
-                 "--mesh and --borders away");
+        complain("--budget, --budget-vertices, --keep and --error-cache are for quadtree meshes with free borders; "
+                 "leave --mesh and --borders away");
     else
         return true;
     return false;
@@ -212,6 +240,8 @@ static int run(const command *self, int argc, const char **argv, bool help)
         {"base", 0, OPTION_NUMBER, &set.base, NULL, "THICKNESS",
          "close the mesh to a solid with walls and a floor this far below its lowest point, 1e-6...1e30", 1e-6, 1e30,
          NULL},
+        {"error-cache", 0, OPTION_TEXT, &set.error_cache, NULL, "FILE",
+         "a GeoTIFF that keeps what every bound and budget needs: used again while the DEM stays the same", 0, 0, NULL},
         {"verify", 0, OPTION_FLAG, &set.verify, NULL, NULL, "measure the finished mesh against every sample", 0, 0,
          NULL},
         {"frame", 0, OPTION_CHOICE, &set.frame, NULL, "FRAME",

@@ -53,6 +53,7 @@ typedef struct builder {
     double top_add[TL_SIZES]; /* of the top */
     double top_rounding;
     tl_run run;
+    bool only_looks; /* at what the checksum needs */
 } builder;
 
 /* ---- Reading a block -------------------------------------------------------------------------------- */
@@ -163,11 +164,13 @@ static tl_status look_at_block(void *context, tl_parallel *loop, uint64_t item, 
     if (status != TL_OK)
         return status;
     tl_heights of = {own->read, at.width + 1, at.width + 1, at.height + 1};
-    find_range(own->read, of.width * of.height, found);
     found->magnitude = tl_heights_magnitude(&of, &found->voids);
-    found->rounds = tl_heights_round(&of, found->magnitude, self->shape->lattice_log);
     found->hash = hash_block(own->read, &at, tl_int64_min(self->side, self->width - at.x),
                              tl_int64_min(self->side, self->height - at.y));
+    if (self->only_looks)
+        return TL_OK;
+    find_range(own->read, of.width * of.height, found);
+    found->rounds = tl_heights_round(&of, found->magnitude, self->shape->lattice_log);
     store_corners(self, &at, own->read);
     return self->pyramid->bends ? look_at_rises(self, &at, own, error) : TL_OK;
 }
@@ -636,25 +639,52 @@ static void free_builder(builder *self)
     free(self->borders);
 }
 
-static tl_status build(builder *self, tl_error *error)
+/* Where bent frames have their samples. */
+static uint64_t hash_place(uint64_t hash, const tl_georef *georef)
+{
+    double numbers[7];
+    memcpy(numbers, georef->transform, sizeof georef->transform);
+    numbers[6] = georef->height_unit;
+    for (int k = 0; k < 7; k++) {
+        uint64_t bits;
+        memcpy(&bits, &numbers[k], sizeof bits);
+        hash = mix(hash, bits);
+    }
+    for (const char *c = tl_crs_wkt(georef->crs); *c; c++)
+        hash = mix(hash, (unsigned char)*c);
+    return hash;
+}
+
+/* The first pass. */
+static tl_status look(builder *self, tl_error *error)
 {
     uint64_t blocks = (uint64_t)(self->shape->columns * self->shape->rows);
-    uint64_t samples = (uint64_t)self->width * (uint64_t)self->height;
     tl_status status = make_builder(self, error);
-    tl_run quietly = self->run; /* the first pass takes little */
+    tl_run quietly = self->run; /* it takes little */
     quietly.progress = NULL;
     if (status == TL_OK)
         status = tl_parallel_for(&quietly, blocks, 0, look_at_block, self, error);
     if (status != TL_OK)
         return status;
     sum_facts(self);
+    self->pyramid->checksum =
+        self->pyramid->bends ? hash_place(self->all.hash, &self->shape->info.georef) : self->all.hash;
+    self->pyramid->shape->voids = self->all.voids;
+    return TL_OK;
+}
+
+static tl_status build(builder *self, tl_error *error)
+{
+    uint64_t blocks = (uint64_t)(self->shape->columns * self->shape->rows);
+    uint64_t samples = (uint64_t)self->width * (uint64_t)self->height;
+    tl_status status = look(self, error);
+    if (status != TL_OK || self->only_looks)
+        return status;
     if (self->pyramid->bends)
         status = sum_rises(self, error);
     bend_blocks(self);
     self->top_rounding = self->all.rounds ? tl_error_rounding((double)self->all.magnitude) : 0;
     self->pyramid->base = find_base(self);
-    self->pyramid->checksum = self->all.hash;
-    self->pyramid->shape->voids = self->all.voids;
     if (status == TL_OK)
         status = tl_parallel_for(&self->run, blocks, samples, find_block, self, error);
     if (status != TL_OK)
@@ -688,13 +718,9 @@ tl_pyramid *tl_pyramid_allocate(const tl_source_info *info, const tl_pyramid_opt
     return NULL;
 }
 
-tl_pyramid *tl_pyramid_create(const tl_source *dem, const tl_pyramid_options *options, tl_error *error)
+static tl_status run_builder(tl_pyramid *pyramid, const tl_source *dem, const tl_run *run, bool only_looks,
+                             tl_error *error)
 {
-    static const tl_pyramid_options defaults = {0};
-    options = options ? options : &defaults;
-    tl_pyramid *pyramid = tl_pyramid_allocate(&dem->info, options, error);
-    if (!pyramid)
-        return NULL;
     const tl_framework *shape = pyramid->shape;
     builder self = {.pyramid = pyramid,
                     .shape = shape,
@@ -703,15 +729,29 @@ tl_pyramid *tl_pyramid_create(const tl_source *dem, const tl_pyramid_options *op
                     .width = dem->info.width,
                     .height = dem->info.height,
                     .side = shape->block,
-                    .corner_columns = (dem->info.width - 1) / shape->block + 1};
-    if (options->run)
-        self.run = *options->run;
+                    .corner_columns = (dem->info.width - 1) / shape->block + 1,
+                    .only_looks = only_looks};
+    if (run)
+        self.run = *run;
     self.workers = tl_parallel_workers(&self.run, (uint64_t)(shape->columns * shape->rows));
     bool no_cells = !shape->columns || !shape->rows;
     pyramid->shape->voids = no_cells;
     tl_status status = no_cells ? TL_OK : build(&self, error);
     free_builder(&self);
-    if (status == TL_OK)
+    return status;
+}
+
+tl_status tl_pyramid_look(tl_pyramid *pyramid, const tl_source *dem, const tl_run *run, tl_error *error)
+{
+    return run_builder(pyramid, dem, run, true, error);
+}
+
+tl_pyramid *tl_pyramid_create(const tl_source *dem, const tl_pyramid_options *options, tl_error *error)
+{
+    static const tl_pyramid_options defaults = {0};
+    options = options ? options : &defaults;
+    tl_pyramid *pyramid = tl_pyramid_allocate(&dem->info, options, error);
+    if (pyramid && run_builder(pyramid, dem, options->run, false, error) == TL_OK)
         return pyramid;
     tl_pyramid_destroy(pyramid);
     return NULL;

@@ -598,6 +598,15 @@ TL_API tl_status tl_write_mesh(const tl_mesh *mesh, const char *path, const tl_w
 /* ---- Pictures ---------------------------------------------------------------------------------- */
 
 typedef struct tl_preview_options {
+/* Writes an error pyramid to `path` as a GeoTIFF of bytes, or of floats where it is exact. */
+TL_API tl_status tl_pyramid_save(const tl_pyramid *pyramid, const char *path, const tl_write_options *options,
+                                 tl_error *error);
+/* Reads one that tl_pyramid_save wrote, instead of tl_pyramid_create with the same options, which may be NULL. `dem` is
+ * read once for its checksum. TL_ERROR_DATA where the file is damaged, or was made of other heights, with other options
+ * or by another version: then make it again; TL_ERROR_ARGUMENT where it is no pyramid at all. */
+TL_API tl_pyramid *tl_pyramid_load(const char *path, const tl_source *dem, const tl_pyramid_options *options,
+                                   tl_error *error);
+
     int width, height; /* pixels, at most 32768; 0: the source's own shape, at most 2048 on the longer side (hillshade),
                           1920 x 1080 (perspective) */
     double sun_azimuth, sun_elevation; /* degrees, clockwise from north and above the horizon (0 ... 90); both 0: 315

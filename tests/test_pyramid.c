@@ -1,3 +1,4 @@
+#define _GNU_SOURCE /* mkdtemp */
 #include "dem/framework_kernel.h"
 #include "lib/talus.h"
 
@@ -7,6 +8,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <unistd.h>
 
 #include <cmocka.h>
 
@@ -350,6 +352,114 @@ static void pyramidDoesNotDependOnThreads(void **state)
     }
 }
 
+/* ---- Files --------------------------------------------------------------------------------------------- */
+
+static char folder[] = "/tmp/talus-test-XXXXXX";
+
+static int make_folder(void **state)
+{
+    (void)state;
+    return mkdtemp(folder) ? 0 : -1;
+}
+
+static int remove_folder(void **state)
+{
+    (void)state;
+    return rmdir(folder);
+}
+
+static void flip_bit(const char *path, int bit)
+{
+    FILE *file = fopen(path, "r+b");
+    assert_non_null(file);
+    assert_int_equal(fseek(file, bit / 8, SEEK_SET), 0);
+    int byte = fgetc(file);
+    assert_int_equal(fseek(file, bit / 8, SEEK_SET), 0);
+    assert_true(byte >= 0 && fputc(byte ^ 1 << bit % 8, file) >= 0);
+    assert_int_equal(fclose(file), 0);
+}
+
+static void expect_same(const grid *of, const tl_pyramid *a, const tl_pyramid *b)
+{
+    for (int y = 0; y < of->height; y++)
+        for (int x = 0; x < of->width; x++)
+            assert_true(tl_pyramid_error(a, x, y) == tl_pyramid_error(b, x, y));
+}
+
+/* With one bit of the file wrong, which may be one that says nothing. */
+static void expect_same_or_none(const char *path, const grid *of, const tl_pyramid *made, bool exact)
+{
+    FILE *file = fopen(path, "rb");
+    assert_non_null(file);
+    assert_int_equal(fseek(file, 0, SEEK_END), 0);
+    int bit = random_below(8 * (int)ftell(file));
+    assert_int_equal(fclose(file), 0);
+    flip_bit(path, bit);
+    tl_source *source = open_grid(of);
+    tl_error error = {0};
+    tl_pyramid *loaded = tl_pyramid_load(path, source, &(tl_pyramid_options){.exact = exact}, &error);
+    if (loaded)
+        expect_same(of, made, loaded);
+    else
+        assert_true(error.status != TL_OK && strstr(error.text, path));
+    tl_pyramid_destroy(loaded);
+    tl_source_destroy(source);
+    flip_bit(path, bit);
+}
+
+static void expect_no_pyramid(const char *path, const grid *of, bool exact, tl_status status)
+{
+    tl_source *source = open_grid(of);
+    tl_error error = {0};
+    assert_null(tl_pyramid_load(path, source, &(tl_pyramid_options){.exact = exact}, &error));
+    assert_int_equal(error.status, status);
+    assert_non_null(strstr(error.text, path));
+    tl_source_destroy(source);
+}
+
+/* A saved pyramid comes back as it was, for the same heights and options; a damaged one does not. */
+static void pyramidsAreUsedAgainForTheSameHeights(void **state)
+{
+    (void)state;
+    for (int round = 0; round < 8; round++) {
+        char path[64];
+        snprintf(path, sizeof path, "%s/pyramid.tif", folder);
+        random_state = (uint64_t)round;
+        grid of = make_grid(1 + random_below(600), 1 + random_below(300), (terrain)(round % TERRAINS),
+                            round % 3 ? VOIDS_NONE : VOIDS_FEW);
+        bool exact = round % 2;
+        tl_pyramid *made = build(&of, exact, 2);
+        tl_error error = {0};
+        if (tl_pyramid_save(made, path, &(tl_write_options){0}, &error) != TL_OK)
+            fail_msg("%s", error.text);
+        assert_int_equal(tl_pyramid_save(made, path, &(tl_write_options){0}, NULL), TL_ERROR_IO); /* exists */
+        tl_source *source = open_grid(&of);
+        tl_pyramid *loaded = tl_pyramid_load(path, source, &(tl_pyramid_options){.exact = exact}, &error);
+        if (!loaded)
+            fail_msg("%s", error.text);
+        expect_same(&of, made, loaded);
+        tl_framework *a = choose(made, &of, (tl_selection){.max_error = 2});
+        tl_framework *b = choose(loaded, &of, (tl_selection){.max_error = 2});
+        check_same(a, b);
+        tl_framework_destroy(a);
+        tl_framework_destroy(b);
+        tl_source_destroy(source);
+        tl_pyramid_destroy(loaded);
+        if (of.width > 1 && of.height > 1) {
+            expect_no_pyramid(path, &of, !exact, TL_ERROR_DATA);
+            float *z = &of.z[random_below(of.width * of.height)], before = *z;
+            *z = isnan(*z) ? 1 : *z + 1;
+            expect_no_pyramid(path, &of, exact, TL_ERROR_DATA);
+            *z = before;
+            for (int i = 0; i < 20; i++)
+                expect_same_or_none(path, &of, made, exact);
+        }
+        tl_pyramid_destroy(made);
+        assert_int_equal(unlink(path), 0);
+        free(of.z);
+    }
+}
+
 /* ---- Kernels ------------------------------------------------------------------------------------------- */
 
 typedef struct run_of_kernel {
@@ -415,10 +525,15 @@ static void kernelsAgreeBitForBit(void **state)
 int main(void)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(pyramidIsTheDefinitionOnRandomDems), cmocka_unit_test(pyramidIsTheDefinitionAcrossBlocks),
-        cmocka_unit_test(pyramidIsTheDefinitionAboveBlocks),  cmocka_unit_test(pyramidGivesTheFrameworkOfEveryBound),
-        cmocka_unit_test(pyramidIsStrictForEveryBound),       cmocka_unit_test(budgetsAreExactAndNest),
-        cmocka_unit_test(pyramidDoesNotDependOnThreads),      cmocka_unit_test(kernelsAgreeBitForBit),
+        cmocka_unit_test(pyramidIsTheDefinitionOnRandomDems),
+        cmocka_unit_test(pyramidIsTheDefinitionAcrossBlocks),
+        cmocka_unit_test(pyramidIsTheDefinitionAboveBlocks),
+        cmocka_unit_test(pyramidGivesTheFrameworkOfEveryBound),
+        cmocka_unit_test(pyramidIsStrictForEveryBound),
+        cmocka_unit_test(budgetsAreExactAndNest),
+        cmocka_unit_test(pyramidDoesNotDependOnThreads),
+        cmocka_unit_test(pyramidsAreUsedAgainForTheSameHeights),
+        cmocka_unit_test(kernelsAgreeBitForBit),
     };
-    return cmocka_run_group_tests(tests, NULL, NULL);
+    return cmocka_run_group_tests(tests, make_folder, remove_folder);
 }
