@@ -12,6 +12,11 @@
 #include <math.h>
 #include <string.h>
 
+/* What the start of an irregular mesh keeps of its bound. Collapsing from 0.5, 0.6 or 0.7 of it ends in numbers of
+ * triangles within 1 % of each other; from there to the whole, which leaves little to choose, they rise by up to 6 %.
+ */
+static const double START = 0.6;
+
 enum {
     READ_ROWS = 256,
     WINDOW = 512, /* samples between the lines that triangles of the start do not cross, but for larger ones */
@@ -578,14 +583,14 @@ static void free_soup(tl_tin_soup *soup)
     *soup = (tl_tin_soup){0};
 }
 
-/* The mesh of the inner raster and the rim around it. Half of the bound leaves the other half to what is cut or
- * collapsed later. In a bent frame the start is made finer until it leaves enough to that. */
+/* The mesh of the inner raster and the rim around it. What is cut beside voids moves by as much again. In a bent frame
+ * the start is made finer until it leaves enough to that. */
 static tl_status start(builder *self, bool bends, tl_error *error)
 {
     tl_tin_rim rim = {self->heights,          self->width, self->height, self->options->max_error, WINDOW,
                       bends ? rim_sag : NULL, self};
-    bool half = self->options->kind == TL_MESH_TIN || self->rim_voids;
-    self->share = (half ? 0.5 : 1) * (bends ? 15.0 / 16 : 1);
+    self->share = self->rim_voids ? 0.5 : self->options->kind == TL_MESH_TIN ? START : 1;
+    self->share *= bends ? 15.0 / 16 : 1;
     tl_status status;
     for (int tries = 0;; tries++, self->share /= 2) {
         status = start_inside(self, error);
@@ -605,7 +610,7 @@ static tl_status build(builder *self, tl_error *error)
         status = look_at_frame(self, error);
     if (status == TL_OK)
         status = start(self, bends, error);
-    if (status == TL_OK && self->options->kind == TL_MESH_TIN)
+    if (status == TL_OK && self->options->kind == TL_MESH_TIN && self->soup.triangle_count)
         status = collapse_all(self, bends, error);
     return status;
 }

@@ -10,7 +10,7 @@
 
 enum {
     MAX_STAR = 64, /* neighbours of a vertex that is tried */
-    LANES = 8,     /* samples that are compared together */
+    LANES = 8,     /* samples that are compared together, as two quads */
     SLACK = 4,     /* neighbours that a vertex may win before its list moves */
     MAX_SIDE = 1 << 10
 };
@@ -456,7 +456,7 @@ static bool make_fan(const tl_tin_patch *patch, const star *s, int apex, float r
         f->x[i] = (float)s->x[k] - vx;
         f->y[i] = (float)s->y[k] - vy;
         z[i] = s->z[k] - s->z[apex];
-        highest = fmaxf(highest, fabsf(s->z[k]));
+        highest = fabsf(s->z[k]) > highest ? fabsf(s->z[k]) : highest;
     }
     float base = fabsf(s->z[apex]) + highest + (float)ground->max_error;
     for (int k = 0; k < f->count; k++) {
@@ -490,27 +490,44 @@ static bool sample_is_near(const tl_tin_patch *patch, const star *s, const fan *
     return fabs(sum / (double)whole - z) + patch->ground->rounding <= f->limit[k];
 }
 
-/* Whether some of LANES samples may be beyond the limit. */
-static bool lanes_are_unsure(const fan *f, float vx, float vy, const float *restrict xs, const float *restrict ys,
-                             const float *restrict zs)
+/* Four floats, and what comparing them gives: the compiler's own vectors, for it does not find them in loops as short
+ * as these. */
+typedef float quad __attribute__((vector_size(16)));
+typedef int32_t quad_mask __attribute__((vector_size(16)));
+
+static inline quad load_quad(const float *from)
 {
-    float before[LANES];
-    int32_t unsure[LANES] = {0}, any = 0;
-    for (int l = 0; l < LANES; l++)
-        before[l] = f->x[0] * (ys[l] - vy) - f->y[0] * (xs[l] - vx);
+    quad out;
+    memcpy(&out, from, sizeof out);
+    return out;
+}
+
+static inline quad quad_of(float a)
+{
+    return (quad){a, a, a, a};
+}
+
+/* Whether some of LANES samples may be beyond the limit. */
+static bool lanes_are_unsure(const fan *f, float vx, float vy, const float *xs, const float *ys, const float *zs)
+{
+    const quad x[2] = {load_quad(xs), load_quad(xs + 4)}, y[2] = {load_quad(ys), load_quad(ys + 4)};
+    const quad z[2] = {load_quad(zs), load_quad(zs + 4)}, none = quad_of(0);
+    quad before[2];
+    quad_mask unsure = {0};
+    for (int l = 0; l < 2; l++)
+        before[l] = quad_of(f->x[0]) * (y[l] - quad_of(vy)) - quad_of(f->y[0]) * (x[l] - quad_of(vx));
     for (int k = 0; k < f->count; k++) {
-        float bx = f->x[k + 1], by = f->y[k + 1], across = f->across[k], down = f->down[k], at = f->at[k];
-        float sure = f->sure[k];
-        for (int l = 0; l < LANES; l++) {
-            float behind = bx * (ys[l] - vy) - by * (xs[l] - vx);
-            float error = fabsf(across * xs[l] + down * ys[l] + at - zs[l]);
-            unsure[l] |= (before[l] >= 0) & (behind <= 0) & !(error <= sure);
+        const quad bx = quad_of(f->x[k + 1]), by = quad_of(f->y[k + 1]), sure = quad_of(f->sure[k]);
+        const quad across = quad_of(f->across[k]), down = quad_of(f->down[k]), at = quad_of(f->at[k]);
+        for (int l = 0; l < 2; l++) {
+            quad behind = bx * (y[l] - quad_of(vy)) - by * (x[l] - quad_of(vx));
+            quad error = across * x[l] + down * y[l] + at - z[l];
+            /* within only if both hold: neither does for what is not a number */
+            unsure |= (before[l] >= none) & (behind <= none) & ~((error <= sure) & (-error <= sure));
             before[l] = behind;
         }
     }
-    for (int l = 0; l < LANES; l++)
-        any |= unsure[l];
-    return any;
+    return unsure[0] | unsure[1] | unsure[2] | unsure[3];
 }
 
 /* Whether every one of `count` samples is within the limit of its triangle. */
@@ -528,6 +545,11 @@ static bool fan_does(const tl_tin_patch *patch, const star *s, const fan *f, int
     return true;
 }
 
+static inline float larger(float a, float b)
+{
+    return a > b ? a : b;
+}
+
 /* The neighbour that the middle of a star can be moved onto, or -1. */
 static int choose(const tl_tin_patch *patch, const star *s)
 {
@@ -538,7 +560,7 @@ static int choose(const tl_tin_patch *patch, const star *s)
         if (!fan_may_do(s, k, patch->ground->max_error))
             continue;
         for (int i = 0; !samples && i < s->n; i++)
-            reach = fmaxf(reach, fmaxf(fabsf((float)s->x[i]), fabsf((float)s->y[i])));
+            reach = larger(reach, larger(fabsf((float)s->x[i]), fabsf((float)s->y[i])));
         if (!make_fan(patch, s, k, reach, &f))
             continue;
         samples = samples ? samples : gather(patch, s);
