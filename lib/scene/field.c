@@ -94,7 +94,7 @@ static tl_status read_block(const field *f, int level, tl_window window, float *
     fbm_window support = scene_chain_support(&f->chain, &target);
     support.stride = support.width;
     scene_patch g;
-    tl_status status = scene_patch_read(f->dem, (scene_growth){GROWTH, f->trend}, support, &g, error);
+    tl_status status = scene_patch_read(f->dem, (scene_growth){.rings = GROWTH, .trend = f->trend}, support, &g, error);
     if (status != TL_OK)
         return status;
     status = scene_chain_run(&f->chain, &target, load, &g, f->source.info.name, error);

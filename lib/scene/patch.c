@@ -79,10 +79,89 @@ static tl_status read_ground(const tl_source *dem, fbm_window w, float *out, tl_
     return read_part(dem, (tl_window){x0, y0, x1 - x0, y1 - y0}, first + (x0 - w.i), w.width, error);
 }
 
-/* The height of an unknown sample, from its neighbours that are known after `pass` passes: the mean, over the eight
+/* ---- Odd reflection at the rim ---- */
+
+/* Sample `index` of a line of `count`, odd-reflected at both ends: sign * z(at) + share of the ends. With P = count -
+ * 1, T = z(P) - z(0) and index = q P + r, 0 <= r <= P: z(r) + q T for even q, z(0) + z(P) + q T - z(P - r) for odd
+ * ones. */
+typedef struct mirrored {
+    int64_t at;
+    float sign, first, last;
+} mirrored;
+
+static mirrored mirror(int64_t index, int64_t count)
+{
+    int64_t end = count - 1;
+    if (index >= 0 && index <= end)
+        return (mirrored){index, 1, 0, 0};
+    if (end == 0)
+        return (mirrored){0, 1, 0, 0};
+    int64_t q = index >= 0 ? index / end : -((end - 1 - index) / end), r = index - q * end;
+    float turns = (float)q;
+    return q & 1 ? (mirrored){end - r, -1, 1 - turns, 1 + turns} : (mirrored){r, 1, -turns, turns};
+}
+
+/* The samples of a line that a window of it is made from. */
+static void mirrored_range(int64_t begin, size_t width, int64_t count, int64_t *low, int64_t *high)
+{
+    *low = count - 1;
+    *high = 0;
+    for (size_t k = 0; k < width; k++) {
+        mirrored m = mirror(begin + (int64_t)k, count);
+        *low = tl_int64_min(*low, m.first != 0 ? 0 : m.at);
+        *high = tl_int64_max(*high, m.last != 0 ? count - 1 : m.at);
+    }
+}
+
+static inline float mirrored_value(mirrored m, const float *line, size_t stride, int64_t low, int64_t count)
+{
+    float z = m.sign * line[(size_t)(m.at - low) * stride];
+    if (m.first != 0)
+        z += m.first * line[(size_t)(0 - low) * stride];
+    if (m.last != 0)
+        z += m.last * line[(size_t)(count - 1 - low) * stride];
+    return z;
+}
+
+/* Reads a window that may reach beyond the raster, from the samples that it is made from. */
+static tl_status read_reflected(const tl_source *dem, fbm_window w, float *out, tl_error *error)
+{
+    const tl_source_info *info = &dem->info;
+    int64_t x0 = w.i, x1 = w.i + (int64_t)w.width - 1, y0, y1;
+    if (!info->wraps)
+        mirrored_range(w.i, w.width, info->width, &x0, &x1);
+    mirrored_range(w.j, w.height, info->height, &y0, &y1);
+    fbm_window real = {x0, y0, (size_t)(x1 - x0 + 1), (size_t)(y1 - y0 + 1), (size_t)(x1 - x0 + 1)};
+    float *heights = tl_alloc_grid((int64_t)real.width, (int64_t)real.height, sizeof *heights);
+    float *rows = tl_alloc_grid((int64_t)w.width, (int64_t)real.height, sizeof *rows);
+    tl_status status = heights && rows ? read_ground(dem, real, heights, error) : tl_fail_memory(error, info->name);
+    if (status == TL_OK) {
+        for (size_t c = 0; c < w.width; c++) {
+            int64_t x = w.i + (int64_t)c;
+            mirrored m = info->wraps ? (mirrored){x, 1, 0, 0} : mirror(x, info->width);
+            for (size_t r = 0; r < real.height; r++)
+                rows[r * w.width + c] = mirrored_value(m, heights + r * real.width, 1, x0, info->width);
+        }
+        for (size_t r = 0; r < w.height; r++) {
+            mirrored m = mirror(w.j + (int64_t)r, info->height);
+            for (size_t c = 0; c < w.width; c++)
+                out[r * w.width + c] = mirrored_value(m, rows + c, w.width, y0, info->height);
+        }
+    }
+    free(heights);
+    free(rows);
+    return status;
+}
+
+/* ---- Growth ---- */
+
+/* States of a sample: REFLECTED and what is below are known to begin with, FIRST_RING + p - 1 is that of pass p. */
+enum { UNKNOWN, MODEL, REFLECTED, FIRST_RING };
+
+/* The height of an unknown sample, from its neighbours whose state is below `state`: the mean, over the eight
  * directions, of the nearest height and `trend` times the step to it. For fBm on a line the best guess behind two known
  * samples has trend 2^(2H-1) - 1: flat at H = 1/2, straight at H = 1. NaN where no neighbour is known. */
-static float grow_sample(scene_growth growth, const scene_patch *g, size_t x, size_t y, unsigned char pass)
+static float grow_sample(scene_growth growth, const scene_patch *g, size_t x, size_t y, int state)
 {
     float sum = 0;
     int count = 0;
@@ -93,33 +172,60 @@ static float grow_sample(scene_growth growth, const scene_patch *g, size_t x, si
             if ((!dx && !dy) || x1 >= g->window.width || y1 >= g->window.height)
                 continue;
             size_t k1 = y1 * g->window.width + x1, k2 = y2 * g->window.width + x2;
-            if (g->known[k1] == 0 || g->known[k1] > pass)
+            if (g->known[k1] == UNKNOWN || g->known[k1] >= state)
                 continue;
-            bool second = x2 < g->window.width && y2 < g->window.height && g->known[k2] && g->known[k2] <= pass;
+            bool second = x2 < g->window.width && y2 < g->window.height && g->known[k2] && g->known[k2] < state;
             sum += g->heights[k1] + (second ? growth.trend * (g->heights[k1] - g->heights[k2]) : 0);
             count++;
         }
     return count ? sum / (float)count : NAN;
 }
 
-/* Fills the unknown samples ring by ring. known[k] is 0 for unknown, 1 for the DEM's, p + 1 for those of pass p; a pass
- * sees only those before it, so the result does not depend on the order of samples nor on where the window lies. */
-static void grow(scene_growth growth, scene_patch *g)
+/* Samples that are to be looked at, each once. */
+typedef struct frontier {
+    uint32_t *samples;
+    size_t count;
+} frontier;
+
+/* Marks unknown neighbours of sample k as wanted, and adds them. */
+static void add_unknown_neighbours(const scene_patch *g, size_t k, unsigned char *wanted, frontier *out)
 {
-    for (int pass = 1; pass <= growth.rings; pass++)
-        for (size_t y = 0; y < g->window.height; y++)
-            for (size_t x = 0; x < g->window.width; x++) {
-                size_t k = y * g->window.width + x;
-                if (g->known[k])
-                    continue;
-                float height = grow_sample(growth, g, x, y, (unsigned char)pass);
-                if (isfinite(height)) {
-                    g->heights[k] = height;
-                    g->known[k] = (unsigned char)(pass + 1);
-                }
+    size_t width = g->window.width, x = k % width, y = k / width;
+    for (int dy = -1; dy <= 1; dy++)
+        for (int dx = -1; dx <= 1; dx++) {
+            size_t x1 = x + (size_t)dx, y1 = y + (size_t)dy, at = y1 * width + x1;
+            if (x1 >= width || y1 >= g->window.height || g->known[at] != UNKNOWN || wanted[at])
+                continue;
+            wanted[at] = 1;
+            out->samples[out->count++] = (uint32_t)at;
+        }
+}
+
+/* Fills the unknown samples ring by ring; a pass sees only those before it, so the result does not depend on the order
+ * of samples nor on where the window lies. `wanted` is one zero a sample, `rings` two of room for all. */
+static void grow(scene_growth growth, scene_patch *g, unsigned char *wanted, frontier rings[2])
+{
+    size_t count = g->window.width * g->window.height;
+    for (size_t k = 0; k < count; k++)
+        if (g->known[k])
+            add_unknown_neighbours(g, k, wanted, &rings[0]);
+    for (int pass = 0; pass < growth.rings; pass++) {
+        frontier *now = &rings[pass & 1], *next = &rings[~pass & 1];
+        next->count = 0;
+        for (size_t i = 0; i < now->count; i++) {
+            size_t k = now->samples[i];
+            float height = grow_sample(growth, g, k % g->window.width, k / g->window.width, FIRST_RING + pass);
+            if (isfinite(height)) {
+                g->heights[k] = height;
+                g->known[k] = (unsigned char)(FIRST_RING + pass);
             }
+        }
+        for (size_t i = 0; i < now->count; i++)
+            if (g->known[now->samples[i]])
+                add_unknown_neighbours(g, now->samples[i], wanted, next);
+    }
     /* nothing that is kept can see what is left; it only must not be NaN */
-    for (size_t k = 0; k < g->window.width * g->window.height; k++)
+    for (size_t k = 0; k < count; k++)
         if (!g->known[k])
             g->heights[k] = 0;
 }
@@ -147,22 +253,60 @@ static void crop(const scene_patch *wide, scene_patch *g)
     }
 }
 
+/* Reads a window with what is reflected, and tells what is known; UNKNOWN are voids. */
+static tl_status read_known(const tl_source *dem, bool reflect, scene_patch *g, bool *all, tl_error *error)
+{
+    fbm_window w = g->window;
+    tl_status status = reflect ? read_reflected(dem, w, g->heights, error) : read_ground(dem, w, g->heights, error);
+    *all = true;
+    for (size_t k = 0; k < w.width * w.height && status == TL_OK; k++) {
+        int64_t x = w.i + (int64_t)(k % w.width), y = w.j + (int64_t)(k / w.width);
+        bool model = y >= 0 && y < dem->info.height && (dem->info.wraps || (x >= 0 && x < dem->info.width));
+        g->known[k] = isnan(g->heights[k]) ? UNKNOWN : model ? MODEL : REFLECTED;
+        *all = *all && g->known[k];
+    }
+    return status;
+}
+
+static tl_status grow_patch(scene_growth growth, scene_patch *g, const char *name, tl_error *error)
+{
+    size_t count = g->window.width * g->window.height;
+    unsigned char *wanted = calloc(count, 1);
+    uint32_t *samples = count <= UINT32_MAX ? tl_alloc(count, 2 * sizeof *samples) : NULL;
+    tl_status status = wanted && samples ? TL_OK : tl_fail_memory(error, name);
+    if (status == TL_OK)
+        grow(growth, g, wanted, (frontier[2]){{samples, 0}, {samples + count, 0}});
+    free(wanted);
+    free(samples);
+    return status;
+}
+
 static tl_status read_with_rim(const tl_source *dem, scene_growth growth, fbm_window w, scene_patch *g, tl_error *error)
 {
     const char *name = dem->info.name;
+    bool all = false;
+    if (growth.reflect) { /* without voids that is all */
+        tl_status status = allocate(g, w, true, name, error);
+        if (status == TL_OK)
+            status = read_known(dem, true, g, &all, error);
+        if (status != TL_OK || all) {
+            if (status != TL_OK)
+                scene_patch_free(g);
+            return status;
+        }
+        scene_patch_free(g);
+    }
     scene_patch wide;
     tl_status status = allocate(&wide, scene_widened(w, 2 * growth.rings), true, name, error);
     if (status != TL_OK)
         return status;
-    status = read_ground(dem, wide.window, wide.heights, error);
+    status = read_known(dem, growth.reflect, &wide, &all, error);
+    if (status == TL_OK)
+        status = grow_patch(growth, &wide, name, error);
     if (status == TL_OK)
         status = allocate(g, w, true, name, error);
-    if (status == TL_OK) {
-        for (size_t k = 0; k < wide.window.width * wide.window.height; k++)
-            wide.known[k] = !isnan(wide.heights[k]);
-        grow(growth, &wide);
+    if (status == TL_OK)
         crop(&wide, g);
-    }
     scene_patch_free(&wide);
     return status;
 }
@@ -181,9 +325,11 @@ tl_status scene_patch_read(const tl_source *dem, scene_growth growth, fbm_window
         tl_status status = allocate(g, w, false, dem->info.name, error);
         if (status == TL_OK)
             status = read_ground(dem, w, g->heights, error);
-        if (status != TL_OK || all_known(g->heights, w.width * w.height))
+        if (status == TL_OK && all_known(g->heights, w.width * w.height))
             return status;
         scene_patch_free(g);
+        if (status != TL_OK)
+            return status;
     }
     return read_with_rim(dem, growth, w, g, error);
 }

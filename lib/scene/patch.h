@@ -12,11 +12,13 @@ typedef struct scene_patch {
     unsigned char *known; /* 1 where the height is the model's; NULL: everywhere */
 } scene_patch;
 
-/* How heights are made up: ring by ring, for `rings` rings around known samples, each the mean over directions of the
- * neighbour's height and a share `trend` of the step to it. What lies farther is 0. */
+/* How heights are made up. First, if `reflect`, beyond the raster's rim: by odd reflection there, z(-k) = 2 z(0) -
+ * z(k). Then ring by ring, for `rings` rings around the known samples, each the mean over directions of the neighbour's
+ * height and a share `trend` of the step to it. What lies farther is 0. */
 typedef struct scene_growth {
     int rings; /* at most 100 */
     float trend;
+    bool reflect;
 } scene_growth;
 
 /* Reads a patch; the result does not depend on where the window lies. Free with scene_patch_free. */

@@ -609,7 +609,7 @@ tl_status scene_terrain_measure(const tl_source *dem, const scene_detail *detail
 {
     const fbm_detail *finest = &detail->octaves[0];
     double blocks = finest->count ? (double)finest->count : 1;
-    *out = (scene_terrain){.growth = {.rings = RINGS, .trend = .9f}};
+    *out = (scene_terrain){.growth = {.rings = RINGS, .trend = .9f, .reflect = true}};
     out->mean_energy = fbm_detail_variance(finest, 0, detail->noise);
     out->noise_energy = (finest->x + finest->y + finest->mixed) / blocks - out->mean_energy;
     set_geometry(out, dem, octaves, levels > CALIBRATED ? levels : CALIBRATED, seed);
