@@ -481,8 +481,8 @@ TL_API tl_framework *tl_framework_from_pyramid(const tl_pyramid *pyramid, const 
 /* Kinds of meshes that keep a bound on their error. */
 typedef enum tl_mesh_kind {
     TL_MESH_QUADTREE = 0, /* that of the framework */
-    TL_MESH_TIN, /* irregular: a finer framework's mesh, its vertices moved onto neighbours while the bound holds. Less
-                    than a third of the triangles, in some twenty times the time */
+    TL_MESH_TIN, /* irregular: a finer framework's mesh, its vertices moved onto neighbours while the bound holds. A
+                    half to a quarter of the triangles, in ten times the time or more */
 } tl_mesh_kind;
 
 typedef struct tl_simplify_options {
@@ -498,8 +498,8 @@ typedef struct tl_simplify_options {
 
 /* Simplifies an elevation model to a mesh: no sample is farther than max_error from it, in double arithmetic; every
  * vertex is a sample. *uncovered (may be NULL) becomes the number of valid samples in no triangle, which lie alone
- * among voids. A TIN takes about 70 bytes a sample of memory where the bound is so small that it starts from all of
- * them. */
+ * among voids. A TIN takes some 80 to 120 bytes a sample of memory where the bound is so small that it starts from
+ * all. */
 TL_API tl_status tl_simplify(const tl_source *dem, const tl_simplify_options *options, tl_mesh **out,
                              uint64_t *uncovered, tl_error *error);
 
