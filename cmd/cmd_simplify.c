@@ -48,8 +48,7 @@ static tl_status add_below(const settings *set, tl_mesh *mesh, tl_error *error)
     return set->base > 0 ? tl_mesh_add_base(mesh, set->base, error) : TL_OK;
 }
 
-static int write_and_check(const settings *set, const tl_source *dem, tl_mesh *mesh, const tl_run *run,
-                           progress *bar)
+static int write_and_check(const settings *set, const tl_source *dem, tl_mesh *mesh, const tl_run *run, progress *bar)
 {
     tl_error error;
     tl_mesh_report check = {0};

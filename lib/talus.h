@@ -429,13 +429,39 @@ TL_API size_t tl_framework_point_count(const tl_framework *framework);
  * sample wide, is tied in by a triangle that reaches up to three samples far and passes no other sample; what is left
  * is farther off, or would pass voids. */
 TL_API size_t tl_framework_isolated_count(const tl_framework *framework);
+/* The largest vertical distance that was asked for or, of a framework that came from a budget, that it keeps. */
+TL_API double tl_framework_max_error(const tl_framework *framework);
 /* Whether sample (i, j), which must lie in the grid, is a characteristic point. */
 TL_API bool tl_framework_has_point(const tl_framework *framework, int64_t i, int64_t j);
 /* The conforming mesh over the characteristic points; it does not need the DEM any more. */
 TL_API tl_status tl_framework_mesh(const tl_framework *framework, tl_mesh **out, tl_error *error);
 
-/* The largest vertical distance that was asked for or, of a framework that came from a budget, that it keeps. */
-TL_API double tl_framework_max_error(const tl_framework *framework);
+/* ---- Simplified meshes --------------------------------------------------------------------------- */
+
+/* Kinds of meshes that keep a bound on their error. */
+typedef enum tl_mesh_kind {
+    TL_MESH_QUADTREE = 0, /* that of the framework */
+    TL_MESH_TIN, /* irregular: a finer framework's mesh, its vertices moved onto neighbours while the bound holds. A
+                    half to a quarter of the triangles, in ten times the time or more */
+} tl_mesh_kind;
+
+typedef struct tl_simplify_options {
+    double max_error; /* largest vertical distance allowed at any sample, in units of height; >= 0 */
+    tl_frame frame;   /* as in tl_framework_options */
+    tl_mesh_kind kind;
+    /* Choose the vertices on the raster's rim by its own samples alone, so that meshes of rasters that share their
+     * outermost samples join without a crack. A TIN always does. (The rim may keep more where voids touch its second
+     * row; in ENU frames, beside ground steeper than 4 in 1.) */
+    bool canonical_borders;
+    const tl_run *run;
+} tl_simplify_options;
+
+/* Simplifies an elevation model to a mesh: no sample is farther than max_error from it, in double arithmetic; every
+ * vertex is a sample. *uncovered (may be NULL) becomes the number of valid samples in no triangle, which lie alone
+ * among voids. A TIN takes some 80 to 120 bytes a sample of memory where the bound is so small that it starts from
+ * all. */
+TL_API tl_status tl_simplify(const tl_source *dem, const tl_simplify_options *options, tl_mesh **out,
+                             uint64_t *uncovered, tl_error *error);
 
 /* ---- Frameworks for every bound ------------------------------------------------------------------ */
 
@@ -476,33 +502,6 @@ typedef struct tl_selection {
 TL_API tl_framework *tl_framework_from_pyramid(const tl_pyramid *pyramid, const tl_source *dem,
                                                const tl_selection *selection, tl_error *error);
 
-/* ---- Simplified meshes --------------------------------------------------------------------------- */
-
-/* Kinds of meshes that keep a bound on their error. */
-typedef enum tl_mesh_kind {
-    TL_MESH_QUADTREE = 0, /* that of the framework */
-    TL_MESH_TIN, /* irregular: a finer framework's mesh, its vertices moved onto neighbours while the bound holds. A
-                    half to a quarter of the triangles, in ten times the time or more */
-} tl_mesh_kind;
-
-typedef struct tl_simplify_options {
-    double max_error; /* largest vertical distance allowed at any sample, in units of height; >= 0 */
-    tl_frame frame;   /* as in tl_framework_options */
-    tl_mesh_kind kind;
-    /* Choose the vertices on the raster's rim by its own samples alone, so that meshes of rasters that share their
-     * outermost samples join without a crack. A TIN always does. (The rim may keep more where voids touch its second
-     * row; in ENU frames, beside ground steeper than 4 in 1.) */
-    bool canonical_borders;
-    const tl_run *run;
-} tl_simplify_options;
-
-/* Simplifies an elevation model to a mesh: no sample is farther than max_error from it, in double arithmetic; every
- * vertex is a sample. *uncovered (may be NULL) becomes the number of valid samples in no triangle, which lie alone
- * among voids. A TIN takes some 80 to 120 bytes a sample of memory where the bound is so small that it starts from
- * all. */
-TL_API tl_status tl_simplify(const tl_source *dem, const tl_simplify_options *options, tl_mesh **out,
-                             uint64_t *uncovered, tl_error *error);
-
 /* ---- The field --------------------------------------------------------------------------------- */
 
 /* A way to refine a lattice, found by name. */
@@ -516,7 +515,7 @@ typedef struct tl_scheme {
 TL_API const tl_scheme *tl_schemes(void);
 
 typedef struct tl_field_options {
-    int levels;         /* halvings of the DEM's spacing, 0 ... 30 */
+    int levels; /* halvings of the DEM's spacing, 0 ... 30 */
     /* A name of tl_schemes(); NULL: "terrain" where neither hurst nor delta is given, else "stationary". */
     const char *scheme;
     bool hurst_given, delta_given;
@@ -595,9 +594,6 @@ TL_API tl_status tl_write_grid(const tl_source *source, const char *path, const 
  * its first vertex, which its header names: single precision is too coarse for them. */
 TL_API tl_status tl_write_mesh(const tl_mesh *mesh, const char *path, const tl_write_options *options, tl_error *error);
 
-/* ---- Pictures ---------------------------------------------------------------------------------- */
-
-typedef struct tl_preview_options {
 /* Writes an error pyramid to `path` as a GeoTIFF of bytes, or of floats where it is exact. */
 TL_API tl_status tl_pyramid_save(const tl_pyramid *pyramid, const char *path, const tl_write_options *options,
                                  tl_error *error);
@@ -607,6 +603,9 @@ TL_API tl_status tl_pyramid_save(const tl_pyramid *pyramid, const char *path, co
 TL_API tl_pyramid *tl_pyramid_load(const char *path, const tl_source *dem, const tl_pyramid_options *options,
                                    tl_error *error);
 
+/* ---- Pictures ---------------------------------------------------------------------------------- */
+
+typedef struct tl_preview_options {
     int width, height; /* pixels, at most 32768; 0: the source's own shape, at most 2048 on the longer side (hillshade),
                           1920 x 1080 (perspective) */
     double sun_azimuth, sun_elevation; /* degrees, clockwise from north and above the horizon (0 ... 90); both 0: 315

@@ -87,7 +87,8 @@ tl_status tl_write_mesh(const tl_mesh *mesh, const char *path, const tl_write_op
     if (!format)
         return TL_ERROR_ARGUMENT;
     if (!format->mesh)
-        return tl_fail(error, TL_ERROR_ARGUMENT, "%s: .%s holds no meshes; use glb, obj, ply or stl", path, format->ending);
+        return tl_fail(error, TL_ERROR_ARGUMENT, "%s: .%s holds no meshes; use glb, obj, ply or stl", path,
+                       format->ending);
     tl_output *output = tl_output_open(path, options->overwrite, error);
     if (!output)
         return TL_ERROR_IO;
