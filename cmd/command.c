@@ -58,22 +58,28 @@ bool command_begin(const command *self, int argc, const char **argv, bool help, 
     return true;
 }
 
-tl_run command_run(const common *options, progress *bar)
+/* What the program takes however little it does. */
+static const size_t own_bytes = 24 << 20;
+
+/* What --memory leaves: a quarter for blocks of the input, the rest for what a command does. */
+static size_t left_bytes(const common *options)
 {
-    return progress_run(bar, options->quiet ? PROGRESS_NONE : (progress_style)options->progress,
-                        (unsigned)options->threads);
+    return ((size_t)(options->memory ? options->memory : DEFAULT_MEMORY) << 20) - own_bytes;
 }
 
-size_t command_bytes(const common *options)
+tl_run command_run(const common *options, progress *bar)
 {
-    return (size_t)(options->memory ? options->memory : DEFAULT_MEMORY) << 20;
+    tl_run run = progress_run(bar, options->quiet ? PROGRESS_NONE : (progress_style)options->progress,
+                              (unsigned)options->threads);
+    run.memory = left_bytes(options) / 4 * 3;
+    return run;
 }
 
 static tl_source *open_files(const common *options, const arguments *inputs, const tl_run *quietly, tl_error *error)
 {
     const tl_dem_options dem = {.band = (unsigned)options->band,
                                 .feather = options->feather,
-                                .memory = command_bytes(options) / 4,
+                                .memory = left_bytes(options) / 4,
                                 .run = quietly};
     if (inputs->count == 1 && !options->feather && !options->band)
         return tl_open_with(inputs->names[0], &dem, error);
@@ -135,8 +141,8 @@ static void cut(const common *options, opened_input *opened, tl_error *error)
 opened_input command_open(const common *options, const arguments *inputs, const tl_run *run, tl_error *error)
 {
     /* opening has no progress to speak of */
-    const tl_run quietly = {.threads = run->threads, .cancel = run->cancel};
-    const tl_geoid_options geoid = {.grid = options->geoid, .memory = command_bytes(options) / 16};
+    const tl_run quietly = {.threads = run->threads, .cancel = run->cancel, .memory = run->memory};
+    const tl_geoid_options geoid = {.grid = options->geoid, .memory = left_bytes(options) / 16};
     tl_void_options voids;
     opened_input opened = {0};
     if (void_options(options, run, &voids, error))

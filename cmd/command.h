@@ -119,8 +119,8 @@ typedef struct common {
          &(c).memory,                                                                                                  \
          NULL,                                                                                                         \
          "MB",                                                                                                         \
-         "to stay in, 16...1048576; a quarter keeps blocks of the input (default: 512)",                               \
-         16,                                                                                                           \
+         "to stay in, 32...1048576; a quarter keeps blocks of the input (default: 512)",                               \
+         32,                                                                                                           \
          1048576,                                                                                                      \
          NULL},                                                                                                        \
         {"progress",                                                                                                   \
@@ -155,8 +155,6 @@ typedef struct opened_input {
     int step_count;
 } opened_input;
 
-/* What --memory gives. */
-size_t command_bytes(const common *options);
 /* Opens the inputs as one source: an EXR, or elevation models. */
 opened_input command_open(const common *options, const arguments *inputs, const tl_run *run, tl_error *error);
 void command_close(opened_input *opened);

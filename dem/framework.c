@@ -13,6 +13,9 @@
 
 enum { READ_ROWS = 256 };
 
+/* Its height, two bits, and what blocks remember of their rims and insides. */
+static const double BYTES_A_SAMPLE = 5;
+
 /* What a block found out about its heights. */
 typedef struct findings {
     float magnitude; /* largest |height| */
@@ -481,6 +484,9 @@ static tl_status build(builder *self, const tl_run *run, tl_error *error)
     bool flat = !framework->columns || !framework->rows; /* one row or column: no triangles */
     phase reading = {run, 0, flat ? samples : 2 * samples}, deciding = {run, samples, 2 * samples}, rest = {run, 0, 0};
     tl_run run_reading = phase_run(&reading), run_deciding = phase_run(&deciding), run_rest = phase_run(&rest);
+    tl_status fits = tl_run_fits(run, BYTES_A_SAMPLE * (double)samples, framework->info.name, "simplifying it", error);
+    if (fits != TL_OK)
+        return fits;
     self->heights = tl_alloc_grid(self->width, self->height, sizeof *self->heights);
     if (!self->heights)
         return tl_fail(error, TL_ERROR_MEMORY, "%s: not enough memory for its %lld x %lld samples",

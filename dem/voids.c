@@ -14,6 +14,8 @@ enum {
     BLOCK = 64,
     SCAN = 8,        /* blocks on a side of a work item of the first pass */
     LARGE = 1 << 20, /* samples of a box from which on all threads work on one */
+    BOX_BYTES = 21, /* a sample of a box takes while it is solved: two copies here, and in the membrane one, an unknown,
+                       a right-hand side, a flag, and a third of five arrays for the coarser levels */
 };
 
 /* Blocks that hold voids and touch by a side, and all that a hole among them can see. */
@@ -376,10 +378,41 @@ static tl_status fill_group(void *context, tl_parallel *loop, uint64_t item, uns
     return status;
 }
 
+/* The most samples that a box of the groups has, of all and of those that are solved side by side. */
+static void largest_boxes(const filling *f, const group *groups, size_t count, int64_t *all, int64_t *small)
+{
+    *all = *small = 0;
+    for (size_t k = 0; k < count; k++) {
+        tl_window box = box_of(f, &groups[k]);
+        int64_t samples = box.width * box.height;
+        *all = tl_int64_max(*all, samples);
+        if (samples < LARGE)
+            *small = tl_int64_max(*small, samples);
+    }
+}
+
+/* Fewer threads where there is no memory for one small box each. */
+static unsigned threads_for(const tl_run *run, double kept, int64_t small)
+{
+    unsigned threads = tl_parallel_workers(run, UINT64_MAX);
+    if (!run || !run->memory || !small)
+        return threads;
+    double fit = ((double)run->memory - kept) / ((double)small * BOX_BYTES);
+    return fit < 1 ? 1 : fit < threads ? (unsigned)fit : threads;
+}
+
 /* Large groups one after the other, each by all threads; the small ones side by side. */
-static tl_status fill_groups(const filling *f, group *groups, size_t count, const tl_run *run, tl_error *error)
+static tl_status fill_groups(const filling *f, group *groups, size_t count, size_t void_blocks, const tl_run *run,
+                             tl_error *error)
 {
     size_t small = 0;
+    int64_t largest, largest_small;
+    double kept = (double)void_blocks * BLOCK * BLOCK * sizeof(float);
+    largest_boxes(f, groups, count, &largest, &largest_small);
+    tl_status fits =
+        tl_run_fits(run, (double)largest * BOX_BYTES + kept, f->v->source.info.name, "filling its voids", error);
+    if (fits != TL_OK)
+        return fits;
     for (size_t k = 0; k < count; k++) {
         tl_window box = box_of(f, &groups[k]);
         if (box.width * box.height < LARGE) {
@@ -394,7 +427,7 @@ static tl_status fill_groups(const filling *f, group *groups, size_t count, cons
             return status;
     }
     tl_run quiet = {.threads = 1, .cancel = run ? run->cancel : NULL};
-    tl_run outer = {.threads = run ? run->threads : 0, .cancel = quiet.cancel};
+    tl_run outer = {.threads = threads_for(run, kept, largest_small), .cancel = quiet.cancel};
     filling rest = *f;
     rest.groups = groups;
     rest.inner = &quiet;
@@ -414,7 +447,7 @@ static tl_status solve(void_source *v, const unsigned char *has_void, size_t voi
         label_blocks(v, has_void, labels);
         size_t count = collect_groups(v, has_void, labels, index, groups);
         filling f = {.v = v, .has_void = has_void, .labels = labels};
-        status = fill_groups(&f, groups, count, run, error);
+        status = fill_groups(&f, groups, count, void_blocks, run, error);
     }
     free(labels);
     free(index);

@@ -69,6 +69,10 @@ typedef struct tl_run {
      * work done and the whole work in samples. NULL: not wanted. */
     void (*progress)(void *user, uint64_t done, uint64_t total);
     void *user; /* handed to progress */
+    /* Bytes that the call may take for itself, beside what its sources keep; 0: as many as it needs. One that needs
+     * more fails with TL_ERROR_MEMORY and tells how many: filled voids, whole meshes, frameworks and pictures are kept
+     * in memory; grids are written in tiles, which take some 4 MB a thread whatever this says. */
+    size_t memory;
 } tl_run;
 
 /* ---- Georeference ------------------------------------------------------------------------------ */

@@ -320,6 +320,32 @@ static void cancellingEndsTheFilling(void **state)
 }
 
 /* The detail around a hole is that of the measured ground: the smooth filling must not count. */
+/* What a large hole takes is told before it is tried, and is enough; with just enough for one small hole at a time many
+ * of them are filled as by all threads. */
+static void memoryIsAskedForBeforeItIsTaken(void **state)
+{
+    (void)state;
+    raster large, small;
+    raster_make(&large, 1500, 900, square);
+    raster_make(&small, 1500, 900, ring);
+    tl_error error = {0};
+    tl_run run = {.threads = 4, .memory = 8 << 20};
+    tl_void_options options = {.rule = TL_VOIDS_FILL, .run = &run};
+    assert_null(tl_voids_create(large.source, &options, &error));
+    assert_int_equal(error.status, TL_ERROR_MEMORY);
+    const char *number = strstr(error.text, "filling its voids takes ");
+    assert_non_null(number);
+    run.memory = (size_t)(atof(number + strlen("filling its voids takes ")) + 1) << 20;
+    tl_source *filled = tl_voids_create(large.source, &options, &error);
+    assert_non_null(filled);
+    tl_source_destroy(filled);
+    filled = tl_voids_create(small.source, &options, &error);
+    assert_non_null(filled);
+    tl_source_destroy(filled);
+    raster_free(&large);
+    raster_free(&small);
+}
+
 static void roughnessLooksAtMeasuredSamplesOnly(void **state)
 {
     (void)state;
@@ -380,6 +406,7 @@ int main(void)
         cmocka_unit_test(allVoidStaysVoid),
         cmocka_unit_test(voidsTakeAValue),
         cmocka_unit_test(cancellingEndsTheFilling),
+        cmocka_unit_test(memoryIsAskedForBeforeItIsTaken),
         cmocka_unit_test(roughnessLooksAtMeasuredSamplesOnly),
         cmocka_unit_test(theFieldTellsWhatIsFilled),
     };

@@ -9,7 +9,11 @@
 #include <stdlib.h>
 #include <time.h>
 
-enum { MAX_WORKERS = 512, PROGRESS_INTERVAL_NS = 100000000 };
+enum {
+    MAX_WORKERS = 512,
+    PROGRESS_INTERVAL_NS = 100000000,
+    THREAD_BYTES = 4 << 20, /* that a worker takes for what it reads, makes and writes */
+};
 
 struct tl_parallel {
     const tl_run *run;
@@ -48,6 +52,8 @@ unsigned tl_parallel_workers(const tl_run *run, uint64_t items)
     uint64_t count = run && run->threads ? run->threads : processors();
     if (count > MAX_WORKERS)
         count = MAX_WORKERS;
+    if (run && run->memory && count > run->memory / THREAD_BYTES)
+        count = run->memory / THREAD_BYTES;
     if (count > items)
         count = items;
     return count ? (unsigned)count : 1;
@@ -232,4 +238,15 @@ void tl_parallel_end_turn(tl_parallel *loop, uint64_t item)
     loop->turn = item + 1;
     pthread_cond_broadcast(&loop->changed);
     pthread_mutex_unlock(&loop->lock);
+}
+
+tl_status tl_run_fits(const tl_run *run, double bytes, const char *name, const char *work, tl_error *error)
+{
+    if (!run || !run->memory || bytes <= (double)run->memory)
+        return TL_OK;
+    /* of what the program is given a quarter goes to the reader, so a third more than what is missing is enough */
+    const double mega = 1 << 20, missing = (bytes - (double)run->memory) * 4 / 3;
+    return tl_fail(error, TL_ERROR_MEMORY,
+                   "%s: %s takes %.0f MB, where %.0f MB are left for it; raise --memory by %.0f MB", name, work,
+                   bytes / mega + 0.5, (double)run->memory / mega, missing / mega + 1);
 }

@@ -28,6 +28,10 @@ tl_status tl_parallel_for(const tl_run *run, uint64_t items, uint64_t samples, t
 bool tl_parallel_wait_turn(tl_parallel *loop, uint64_t item);
 void tl_parallel_end_turn(tl_parallel *loop, uint64_t item);
 
+/* TL_ERROR_MEMORY, described, where `bytes` are more than the run may take: `name` is the thing, `work` what is done
+ * with it, as "filling its voids". */
+tl_status tl_run_fits(const tl_run *run, double bytes, const char *name, const char *work, tl_error *error);
+
 /* TL_ERROR_CANCELLED, described, when the run's cancel flag is up; else TL_OK. */
 tl_status tl_run_check(const tl_run *run, tl_error *error);
 

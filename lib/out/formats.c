@@ -1,4 +1,5 @@
 #include "lib/base/error.h"
+#include "lib/base/parallel.h"
 #include "lib/out/out.h"
 #include "lib/scene/north_up.h"
 
@@ -98,13 +99,20 @@ tl_status tl_write_mesh(const tl_mesh *mesh, const char *path, const tl_write_op
 static tl_status write_as_mesh(const tl_source *source, const char *path, const tl_write_options *options,
                                tl_error *error)
 {
+    /* vertex, triangles and numbers of a sample; a GLB has coordinates and normals of all in memory too */
+    const mesh_writer write = writers_of(path, error)->mesh;
+    const double sample_bytes = write == out_gltf_write ? 96 : 44;
+    double samples = (double)source->info.width * (double)source->info.height;
+    tl_status fits = tl_run_fits(options->run, sample_bytes * samples, path, "the full mesh", error);
+    if (fits != TL_OK && samples <= 0x1p31) /* more are no mesh, whatever the memory: told below */
+        return fits;
     tl_output *output = tl_output_open(path, options->overwrite, error); /* refused before the work, not after it */
     if (!output)
         return TL_ERROR_IO;
     tl_mesh *mesh = NULL;
     tl_status status = tl_mesh_from_source(source, options->run, &mesh, error);
     if (status == TL_OK)
-        status = writers_of(path, error)->mesh(mesh, output, options, error);
+        status = write(mesh, output, options, error);
     tl_mesh_destroy(mesh);
     return finish(output, status, error);
 }

@@ -299,6 +299,10 @@ tl_status scene_hillshade(const tl_source *source, const tl_source *beside, cons
                      : frame_of(info, pixel_of(info, options->width, options->height), options->width, options->height);
     int64_t width = beside ? 2 * f.width + GAP : f.width;
     tl_status status = scene_picture_check(width, f.height, error);
+    const double pixel_bytes = sizeof(float) + 1; /* height and coverage */
+    if (status == TL_OK)
+        status = tl_run_fits(options->run, pixel_bytes * (double)width * (double)f.height, "the picture", "drawing it",
+                             error);
     if (status != TL_OK)
         return status;
     shading *s = calloc(1, sizeof *s);

@@ -247,6 +247,16 @@ static tl_status build(scene_pyramid *p, const tl_run *run, tl_error *error)
     return status;
 }
 
+/* Of the lattices that are held, and the squares that are in work with the step after them. */
+static double bytes_of(const scene_pyramid *p, const tl_run *run)
+{
+    double side = ldexp(1, p->square) + ldexp(4, p->base), samples = 0;
+    for (int k = p->base; k <= p->top; k++)
+        samples += (double)p->lattices[k].width * (double)p->lattices[k].height;
+    side = fmin(side, (double)tl_int64_max(p->source->info.width, p->source->info.height));
+    return sizeof(float) * (samples + 1.25 * side * side * tl_parallel_workers(run, UINT64_MAX));
+}
+
 tl_status scene_pyramid_init(scene_pyramid *pyramid, const tl_source *source, const tl_run *run, tl_error *error)
 {
     *pyramid = (scene_pyramid){.source = source};
@@ -264,7 +274,9 @@ tl_status scene_pyramid_init(scene_pyramid *pyramid, const tl_source *source, co
      * of the base's tiles where a square holds such */
     pyramid->square = pyramid->base > SQUARE_LOG ? pyramid->base : SQUARE_LOG;
     pyramid->block = pyramid->base + TILE_LOG < pyramid->square ? pyramid->base + TILE_LOG : pyramid->square;
-    tl_status status = build(pyramid, run, error);
+    tl_status status = tl_run_fits(run, bytes_of(pyramid, run), source->info.name, "drawing it", error);
+    if (status == TL_OK)
+        status = build(pyramid, run, error);
     if (status != TL_OK)
         scene_pyramid_finish(pyramid);
     return status;

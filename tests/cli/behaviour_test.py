@@ -784,6 +784,25 @@ def memory_does_not_grow_with_the_output(case):
         expect(peaks[1] < 512 << 20, f"{name} {kind}: {peaks[1] >> 20} MiB")
 
 
+def memory_stays_within_what_is_given(case):
+    """A raster of 67 MB of heights in 64 MB, and what does not fit is told before it is tried."""
+    if is_sanitized(case.program):
+        raise Skip("a sanitizer's memory is its own")
+    case.run("noise", "-n", 4096, "-q", "--compression", "none", "-o", "large.tif")
+    for words in (("info", "large.tif"), ("preview", "large.tif", "-o", "a.png"),
+                  ("synth", "large.tif", "-l", 0, "--compression", "none", "-o", "a.exr"),
+                  ("synth", "large.tif", "-l", 0, "--compression", "none", "-o", "a.tif"),
+                  ("synth", "large.tif", "-l", 1, "--window", "1000,1000,1024,1024", "-o", "b.tif")):
+        peak = case.peak_memory(*words, "--memory", 64, "-q")
+        expect(peak < 64 << 20, f"{words[0]}: {peak / 1e6:.1f} MB")
+    for words in (("simplify", "large.tif", "-e", 1, "-o", "a.ply"), ("synth", "large.tif", "-l", 0, "-o", "a.glb"),
+                  ("preview", "large.tif", "-p", "-o", "b.png")):
+        told = case.run(*words, "--memory", 64, status=1).err
+        missing = int(re.search(r"raise --memory by (\d+) MB", told).group(1))
+        if words[0] == "preview":
+            case.run(*words, "--memory", 64 + missing, "-q")
+
+
 # ---- bad input ----
 
 def bad_files_end_with_one_line(case):
@@ -904,7 +923,7 @@ TESTS = [
     area_means_stay_on_their_footprint,
     glb_is_in_metres, frames_agree, simplify_keeps_its_word,
     manuals_show_what_works, man_page_knows_every_option,
-    memory_does_not_grow_with_the_output, bad_files_end_with_one_line,
+    memory_does_not_grow_with_the_output, memory_stays_within_what_is_given, bad_files_end_with_one_line,
     gdal_reads_the_geotiff, gdal_places_the_example, openexr_reads_the_exr, openimageio_agrees_on_the_range,
 ]
 
