@@ -214,6 +214,8 @@ static void verticalKeysGiveNameCodeAndUnit(void **state)
         {5103, 0, NULL, "NAVD88 height", 5703, 1, "COMPOUNDCRS"}, /* GeoTIFF 1.0 */
         {5030, 0, NULL, "ellipsoidal height", 0, 1, "GEOGCRS"},
         {5030, 9002, NULL, "ellipsoidal height", 0, 0.3048, "GEOGCRS"},
+        {4979, 9001, NULL, "ellipsoidal height", 0, 1, "GEOGCRS"}, /* GeoTIFF 1.1 */
+        {32767, 9003, "Ellipsoidal height|", "ellipsoidal height", 0, 1200.0 / 3937.0, "GEOGCRS"},
         {32767, 9002, "Old gauge|", "Old gauge", 0, 0.3048, "COMPOUNDCRS"},
         {4326, 0, NULL, "", 0, 1, "GEOGCRS"}, /* none of heights */
     };
@@ -358,11 +360,109 @@ static void localFrameIsEastNorthUp(void **state)
 }
 
 /* Radii of curvature at a latitude: along the meridian and across it. */
+static void radii_of(double a, double f, double latitude, double *meridian, double *normal)
+{
+    double e2 = f * (2 - f), s = sin(latitude * radians), w = 1 - e2 * s * s;
+    *normal = a / sqrt(w);
+    *meridian = a * (1 - e2) / (w * sqrt(w));
+}
+
 static void radii(double latitude, double *meridian, double *normal)
 {
-    double e2 = wgs84_f * (2 - wgs84_f), s = sin(latitude * radians), w = 1 - e2 * s * s;
-    *normal = wgs84_a / sqrt(w);
-    *meridian = wgs84_a * (1 - e2) / (w * sqrt(w));
+    radii_of(wgs84_a, wgs84_f, latitude, meridian, normal);
+}
+
+/* Ellipsoids of other bodies, by the IAU; Vesta's is the flattest that anyone has mapped. */
+static const struct body {
+    const char *name, *crs;
+    double a, b;
+} bodies[] = {{"Moon", "+proj=longlat +R=1737400", 1737400, 1737400},
+              {"Mars", "+proj=longlat +a=3396190 +b=3376200", 3396190, 3376200},
+              {"Mercury", "+proj=longlat +a=2440530 +b=2438260", 2440530, 2438260},
+              {"Vesta", "+proj=longlat +a=280900 +b=226200", 280900, 226200}};
+enum { BODIES = sizeof bodies / sizeof *bodies };
+
+/* Cartesian coordinates from the body's centre. */
+static void geocentric(double a, double f, double longitude, double latitude, double height, double out[3])
+{
+    double meridian, normal, l = longitude * radians, p = latitude * radians;
+    radii_of(a, f, latitude, &meridian, &normal);
+    out[0] = (normal + height) * cos(p) * cos(l);
+    out[1] = (normal + height) * cos(p) * sin(l);
+    out[2] = ((1 - f) * (1 - f) * normal + height) * sin(p);
+}
+
+static void localFramesFitEveryBody(void **state)
+{
+    (void)state;
+    const double origins[][3] = {{0, 0, 0}, {137.4, -4.6, -4500}, {-179.99, 77, 21000}, {12, -89.5, 100}};
+    for (int k = 0; k < BODIES; k++)
+        for (int o = 0; o < 4; o++) {
+            tl_crs *crs = crs_of(bodies[k].crs);
+            double a = bodies[k].a, f = (a - bodies[k].b) / a, l = origins[o][0] * radians, p = origins[o][1] * radians;
+            dem_local_frame *frame = dem_local_frame_create(crs, origins[o][0], origins[o][1], origins[o][2], NULL);
+            double centre[3], there[3], xyz[3];
+            geocentric(a, f, origins[o][0], origins[o][1], origins[o][2], centre);
+            for (int step = -2; step <= 2; step++) {
+                double longitude = origins[o][0] + 0.3 * step, latitude = origins[o][1] + 0.2 * step,
+                       height = 1000 * step;
+                geocentric(a, f, longitude, latitude, height, there);
+                double d[3] = {there[0] - centre[0], there[1] - centre[1], there[2] - centre[2]};
+                dem_local_frame_forward(frame, longitude, latitude, height, xyz);
+                /* coordinates of 3e6 m round to 5e-10 m, and some are subtracted */
+                close_to(xyz[0], -sin(l) * d[0] + cos(l) * d[1], 1e-8);
+                close_to(xyz[1], -sin(p) * cos(l) * d[0] - sin(p) * sin(l) * d[1] + cos(p) * d[2], 1e-8);
+                close_to(xyz[2], cos(p) * cos(l) * d[0] + cos(p) * sin(l) * d[1] + sin(p) * d[2], 1e-8);
+            }
+            dem_local_frame_destroy(frame);
+            tl_crs_release(crs);
+        }
+}
+
+static void cellsOfEveryBodyAreGeodesics(void **state)
+{
+    (void)state;
+    const double step = 1 / 128.0, latitudes[] = {0.0, -4.6, 65, -89};
+    for (int k = 0; k < BODIES; k++)
+        for (int j = 0; j < 4; j++) {
+            tl_crs *crs = crs_of(bodies[k].crs);
+            tl_georef georef = {.crs = crs, .located = true, .transform = {7, step, 0, latitudes[j] + step, 0, -step}};
+            assert_int_equal(dem_georef_measure(&georef, 3, 3, NULL), TL_OK);
+            double meridian, normal, a = bodies[k].a;
+            radii_of(a, (a - bodies[k].b) / a, latitudes[j], &meridian, &normal);
+            /* the arc's bend: the square of the step, 1.9e-8, over 24, more where the radius itself changes */
+            close_to(georef.cell_x / (normal * cos(latitudes[j] * radians) * step * radians), 1, 1e-7);
+            close_to(georef.cell_y / (meridian * step * radians), 1, 1e-7);
+            tl_crs_release(crs);
+        }
+}
+
+/* Maps of other bodies have their own degrees: the closed forms on spheres. */
+static void mapsOfOtherBodiesHaveTheirDegrees(void **state)
+{
+    (void)state;
+    const double moon = 1737400, mars = 3396190, pi = 3.14159265358979323846;
+    tl_crs *pole = crs_of("+proj=stere +lat_0=-90 +lon_0=0 +R=1737400");
+    tl_crs *plate = crs_of("+proj=eqc +lat_ts=0 +lon_0=180 +R=3396190");
+    double lonlat[2];
+    to_lonlat(pole, 100000, 50000, lonlat);
+    close_to(lonlat[0], atan2(100000, 50000) / radians, 1e-9);
+    close_to(lonlat[1], -(90 - 2 * atan(hypot(100000, 50000) / (2 * moon)) / radians), 1e-9);
+    to_lonlat(plate, -1000000, 500000, lonlat);
+    close_to(lonlat[0], 180 - 1000000 / mars * 180 / pi, 1e-9);
+    close_to(lonlat[1], 500000 / mars * 180 / pi, 1e-9);
+    tl_georef georef = {.crs = pole, .located = true, .transform = {-5000, 20, 0, 5000, 0, -20}, .height_unit = 1};
+    assert_int_equal(dem_georef_measure(&georef, 501, 501, NULL), TL_OK);
+    assert_true(georef.cell_x == 20 && georef.cell_y == 20);
+    tl_source_info info = {.width = 501, .height = 501, .type = TL_RASTER_POINT, .georef = georef, .name = "pole"};
+    double bounds[4];
+    assert_int_equal(tl_source_bounds(&info, bounds, NULL), TL_OK);
+    close_to(bounds[0], -180, 0);
+    close_to(bounds[2], 180, 0);
+    close_to(bounds[1], -90, 0);
+    close_to(bounds[3], -(90 - 2 * atan(5000 * sqrt(2) / (2 * moon)) / radians), 1e-9);
+    tl_crs_release(pole);
+    tl_crs_release(plate);
 }
 
 static void geographicCellsAreGeodesics(void **state)
@@ -490,6 +590,9 @@ int main(void)
         cmocka_unit_test(northingFirstSystemsKeepEastingAsX),
         cmocka_unit_test(pointsWithoutAnImageAreNan),
         cmocka_unit_test(localFrameIsEastNorthUp),
+        cmocka_unit_test(localFramesFitEveryBody),
+        cmocka_unit_test(cellsOfEveryBodyAreGeodesics),
+        cmocka_unit_test(mapsOfOtherBodiesHaveTheirDegrees),
         cmocka_unit_test(geographicCellsAreGeodesics),
         cmocka_unit_test(cellsOfGlobalAndSenselessRastersAreFinite),
         cmocka_unit_test(boundsHoldPolesAndTheAntimeridian),
