@@ -5,6 +5,7 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/stat.h>
+#include <unistd.h>
 
 typedef struct settings {
     common common;
@@ -25,6 +26,15 @@ static const char *const border_names[] = {[BORDERS_FREE] = "free", [BORDERS_CAN
 
 static int report_check(const settings *set, const tl_mesh_report *check)
 {
+    if (!(check->max_error <= set->max_error)) {
+        complain(
+            "%s: its numbers are %.3g more than %.9g from the DEM at column %lld, row %lld; if they are too coarse "
+            "for that, use .ply with --frame projected or pixel; there it would be a fault of talus, please "
+            "report it",
+            set->common.output, check->max_error - set->max_error, set->max_error, (long long)check->worst_i,
+            (long long)check->worst_j);
+        return EXIT_FAILED;
+    }
     if (check->samples == 0)
         command_say(&set->common, "verified: no triangle covers a sample; %llu samples are uncovered",
                     (unsigned long long)check->uncovered);
@@ -33,11 +43,7 @@ static int report_check(const settings *set, const tl_mesh_report *check)
                     "verified: largest error %.7g at column %lld, row %lld; rms %.4g; %llu samples, %llu uncovered",
                     check->max_error, (long long)check->worst_i, (long long)check->worst_j, check->rms_error,
                     (unsigned long long)check->samples, (unsigned long long)check->uncovered);
-    if (check->max_error <= set->max_error)
-        return EXIT_DONE;
-    complain("the mesh is %.9g from the DEM where %.9g was asked for: this is a fault of talus, please report it",
-             check->max_error, set->max_error);
-    return EXIT_FAILED;
+    return EXIT_DONE;
 }
 
 /* What goes below the surface that was checked. */
@@ -48,23 +54,27 @@ static tl_status add_below(const settings *set, tl_mesh *mesh, tl_error *error)
     return set->base > 0 ? tl_mesh_add_base(mesh, set->base, error) : TL_OK;
 }
 
+/* Writes the mesh; and checks what the file has, by its own numbers. */
 static int write_and_check(const settings *set, const tl_source *dem, tl_mesh *mesh, const tl_run *run, progress *bar)
 {
     tl_error error;
     tl_mesh_report check = {0};
-    progress_stage(bar, "verifying");
-    if (set->verify && tl_mesh_verify_in(mesh, dem, (tl_frame)set->frame, run, &check, &error) != TL_OK)
-        return command_failed(bar, &error);
-    progress_end(bar);
-    int status = set->verify ? report_check(set, &check) : EXIT_DONE;
-    if (status != EXIT_DONE)
-        return status;
     progress_stage(bar, "writing");
     tl_write_options options = {.overwrite = set->common.overwrite, .frame = (tl_frame)set->frame, .run = run};
     if (add_below(set, mesh, &error) != TL_OK || tl_write_mesh(mesh, set->common.output, &options, &error) != TL_OK)
         return command_failed(bar, &error);
     progress_end(bar);
-    return EXIT_DONE;
+    if (!set->verify)
+        return EXIT_DONE;
+    progress_stage(bar, "verifying");
+    int status = EXIT_DONE;
+    if (tl_mesh_verify_file(set->common.output, mesh, dem, options.frame, run, &check, &error) != TL_OK)
+        status = command_failed(bar, &error);
+    progress_end(bar);
+    status = status == EXIT_DONE ? report_check(set, &check) : status;
+    if (status != EXIT_DONE)
+        unlink(set->common.output); /* a failed run leaves nothing */
+    return status;
 }
 
 static void report(const settings *set, const tl_source *dem, uint64_t isolated, const tl_mesh *mesh, double seconds)
@@ -241,8 +251,8 @@ static int run(const command *self, int argc, const char **argv, bool help)
          NULL},
         {"error-cache", 0, OPTION_TEXT, &set.error_cache, NULL, "FILE",
          "a GeoTIFF that keeps what every bound and budget needs: used again while the DEM stays the same", 0, 0, NULL},
-        {"verify", 0, OPTION_FLAG, &set.verify, NULL, NULL, "measure the finished mesh against every sample", 0, 0,
-         NULL},
+        {"verify", 0, OPTION_FLAG, &set.verify, NULL, NULL,
+         "read the written file back and measure it against every sample", 0, 0, NULL},
         {"frame", 0, OPTION_CHOICE, &set.frame, NULL, "FRAME",
          "coordinates of the mesh (default: enu where the CRS is known)", 0, 0, frame_names},
         {0}};

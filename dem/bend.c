@@ -26,7 +26,8 @@ static void lonlat(const dem_space *space, double i, double j, double *longitude
     dem_projection_to_lonlat(space->projection, 1, longitude, latitude);
 }
 
-dem_space *dem_space_create(const tl_georef *georef, int64_t width, int64_t height, const char *name, tl_error *error)
+/* Without its local frame. */
+static dem_space *begin(const tl_georef *georef, const char *name, tl_error *error)
 {
     dem_space *space = calloc(1, sizeof *space);
     if (!space) {
@@ -39,16 +40,36 @@ dem_space *dem_space_create(const tl_georef *georef, int64_t width, int64_t heig
     space->step = cell > 0 && cell <= DBL_MAX ? 1000 / cell : 1;
     space->georef = georef;
     space->projection = dem_projection_create(georef->crs, error);
-    double x = 0, y = 0;
-    if (space->projection) {
-        lonlat(space, 0.5 * (double)(width - 1), 0.5 * (double)(height - 1), &x, &y);
-        if (isfinite(x) && isfinite(y))
-            space->local = dem_local_frame_create(georef->crs, x, y, 0, error);
-        else
-            tl_fail(error, TL_ERROR_DATA, "%s: the raster's middle has no longitude and latitude in %s; use %s", name,
-                    tl_crs_name(georef->crs), "--frame projected");
-    }
+    if (space->projection)
+        return space;
+    dem_space_destroy(space);
+    return NULL;
+}
+
+dem_space *dem_space_create(const tl_georef *georef, int64_t width, int64_t height, const char *name, tl_error *error)
+{
+    dem_space *space = begin(georef, name, error);
+    double x, y;
+    if (!space)
+        return NULL;
+    lonlat(space, 0.5 * (double)(width - 1), 0.5 * (double)(height - 1), &x, &y);
+    if (isfinite(x) && isfinite(y))
+        space->local = dem_local_frame_create(georef->crs, x, y, 0, error);
+    else
+        tl_fail(error, TL_ERROR_DATA, "%s: the raster's middle has no longitude and latitude in %s; use %s", name,
+                tl_crs_name(georef->crs), "--frame projected");
     if (space->local)
+        return space;
+    dem_space_destroy(space);
+    return NULL;
+}
+
+dem_space *dem_space_create_at(const tl_georef *georef, const double origin[3], const char *name, tl_error *error)
+{
+    dem_space *space = begin(georef, name, error);
+    if (space)
+        space->local = dem_local_frame_create(georef->crs, origin[0], origin[1], origin[2], error);
+    if (space && space->local)
         return space;
     dem_space_destroy(space);
     return NULL;

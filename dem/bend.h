@@ -19,6 +19,8 @@ typedef struct dem_space dem_space;
 bool dem_frame_bends(const tl_georef *georef, tl_frame frame);
 /* Borrows `georef`, of a raster of width x height samples that lies on a known CRS. */
 dem_space *dem_space_create(const tl_georef *georef, int64_t width, int64_t height, const char *name, tl_error *error);
+/* The same with its origin there: longitude, latitude, height in metres. */
+dem_space *dem_space_create_at(const tl_georef *georef, const double origin[3], const char *name, tl_error *error);
 void dem_space_destroy(dem_space *space);
 /* The lattice's point (i, j) at height h in metres; and, where up is not NULL, the unit vector upwards there. */
 void dem_space_at(const dem_space *space, double i, double j, double h, double xyz[3], double up[3]);

@@ -1,5 +1,7 @@
 /* The check on meshes: every triangle over every sample that it covers, whatever made them. It knows nothing of the
  * framework, so that neither can hide the other's mistakes. */
+#include "dem/verify.h"
+
 #include "dem/bend.h"
 #include "lib/base/error.h"
 #include "lib/base/parallel.h"
@@ -28,16 +30,17 @@ typedef struct verifier {
     const tl_source *source;
     int64_t width, height, band_rows;
     size_t bands;
-    size_t *first;        /* where the triangles of a band begin in `triangles`; bands + 1 */
-    uint32_t *triangles;  /* by band, every triangle in each band that it reaches */
-    float **heights;      /* by worker: the band's samples */
-    double **errors;      /* and the largest error of each, negative where no triangle covers it */
-    band_result *results; /* by band */
-    bool bent;            /* the rest is for frames where the lattice is bent: */
-    place *corners;       /* of the mesh, by vertex; only `at` */
-    place **places;       /* by worker: the band's samples */
-    double **beside;      /* and the error of each on the lattice's triangle, for those beside all flat ones */
-    dem_space **spaces;   /* by worker */
+    size_t *first;            /* where the triangles of a band begin in `triangles`; bands + 1 */
+    uint32_t *triangles;      /* by band, every triangle in each band that it reaches */
+    float **heights;          /* by worker: the band's samples */
+    double **errors;          /* and the largest error of each, negative where no triangle covers it */
+    band_result *results;     /* by band */
+    const dem_placed *placed; /* NULL: vertices are at their samples */
+    bool bent;                /* the rest is for frames where the lattice is bent: */
+    place *corners;           /* of the mesh, by vertex; only `at` */
+    place **places;           /* by worker: the band's samples */
+    double **beside;          /* and the error of each on the lattice's triangle, for those beside all flat ones */
+    dem_space **spaces;       /* by worker */
 } verifier;
 
 static const tl_vertex *corner(const verifier *self, size_t triangle, int k)
@@ -77,13 +80,22 @@ static inline void note(double *error, double e)
         *error = e;
 }
 
-/* Compares row y of a triangle of positive area; `x0` ... `x1` are its columns, heights and errors those of the row. */
-static void compare_row(const tl_vertex *const v[3], int64_t whole, int64_t y, int64_t x0, int64_t x1, const float *z,
-                        double *errors)
+/* A triangle of positive area on the lattice, and its plane: by the corners' weights where these are at their samples,
+ * which is exact wherever heights have few enough bits; else by its slopes from the place `at`. */
+typedef struct flat {
+    const tl_vertex *v[3];
+    int64_t whole;
+    double z[3];
+    bool moved;
+    double at[3], across, down;
+} flat;
+
+/* Compares row y of a triangle; `x0` ... `x1` are its columns, heights and errors those of the row. */
+static void compare_row(const flat *of, int64_t y, int64_t x0, int64_t x1, const float *z, double *errors)
 {
     int64_t low = x0, high = x1, w[3], step[3];
     for (int k = 0; k < 3; k++) { /* the weight of vertex k is the area on the opposite side */
-        const tl_vertex *a = v[(k + 1) % 3], *b = v[(k + 2) % 3];
+        const tl_vertex *a = of->v[(k + 1) % 3], *b = of->v[(k + 2) % 3];
         w[k] = area(a, b, x0, y);
         step[k] = (int64_t)a->j - b->j;
         narrow(w[k], step[k], x0, &low, &high);
@@ -91,33 +103,61 @@ static void compare_row(const tl_vertex *const v[3], int64_t whole, int64_t y, i
     for (int64_t x = low; x <= high; x++) {
         double sum = 0;
         for (int k = 0; k < 3; k++)
-            sum += (double)(w[k] + step[k] * (x - x0)) * (double)v[k]->z;
+            sum += (double)(w[k] + step[k] * (x - x0)) * of->z[k];
+        double plane = of->moved ? of->at[2] + of->across * ((double)x - of->at[0]) + of->down * ((double)y - of->at[1])
+                                 : sum / (double)of->whole;
         if (fabsf(z[x]) <= FLT_MAX) /* not a void */
-            note(&errors[x], fabs(sum / (double)whole - (double)z[x]));
+            note(&errors[x], fabs(plane - (double)z[x]));
     }
+}
+
+/* The plane of a triangle by the places of its corners. */
+static void place_flat(flat *to, const double *const p[3])
+{
+    double u[2][3];
+    for (int k = 0; k < 3; k++) {
+        to->z[k] = p[k][2];
+        to->at[k] = p[0][k];
+        to->moved |= p[k][0] != to->v[k]->i || p[k][1] != to->v[k]->j;
+    }
+    for (int a = 0; a < 3; a++) {
+        u[0][a] = p[1][a] - p[0][a];
+        u[1][a] = p[2][a] - p[0][a];
+    }
+    double twice = u[0][0] * u[1][1] - u[0][1] * u[1][0];
+    to->across = (u[0][2] * u[1][1] - u[1][2] * u[0][1]) / twice;
+    to->down = (u[1][2] * u[0][0] - u[0][2] * u[1][0]) / twice;
 }
 
 /* Compares the part of a triangle in rows top ... bottom. */
 static void compare_triangle(const verifier *self, size_t triangle, int64_t top, int64_t bottom, const float *heights,
                              double *errors)
 {
-    const tl_vertex *v[3] = {corner(self, triangle, 0), corner(self, triangle, 1), corner(self, triangle, 2)};
-    int64_t whole = area(v[0], v[1], v[2]->i, v[2]->j);
-    if (whole == 0)
+    flat of = {.v = {corner(self, triangle, 0), corner(self, triangle, 1), corner(self, triangle, 2)}};
+    const tl_vertex **v = of.v;
+    of.whole = area(v[0], v[1], v[2]->i, v[2]->j);
+    if (of.whole == 0)
         return; /* covers nothing */
-    if (whole < 0) {
+    if (of.whole < 0) {
         const tl_vertex *swap = v[1];
         v[1] = v[2];
         v[2] = swap;
-        whole = -whole;
+        of.whole = -of.whole;
     }
+    const double *places[3];
+    for (int k = 0; k < 3; k++) {
+        of.z[k] = (double)v[k]->z;
+        places[k] = self->placed ? self->placed->at[v[k] - self->mesh->vertices] : NULL;
+    }
+    if (self->placed)
+        place_flat(&of, places);
     int64_t x0 = tl_int64_min(tl_int64_min(v[0]->i, v[1]->i), v[2]->i);
     int64_t x1 = tl_int64_max(tl_int64_max(v[0]->i, v[1]->i), v[2]->i);
     int64_t y0 = tl_int64_max(tl_int64_min(tl_int64_min(v[0]->j, v[1]->j), v[2]->j), top);
     int64_t y1 = tl_int64_min(tl_int64_max(tl_int64_max(v[0]->j, v[1]->j), v[2]->j), bottom);
     for (int64_t y = y0; y <= y1; y++) {
         int64_t offset = (y - top) * self->width;
-        compare_row(v, whole, y, x0, x1, heights + offset, errors + offset);
+        compare_row(&of, y, x0, x1, heights + offset, errors + offset);
     }
 }
 
@@ -190,14 +230,16 @@ static void compare_place(const verifier *self, const tl_vertex *const v[3], con
     int64_t at = (y - band->top) * self->width + x;
     if (!(fabsf(band->heights[at]) <= FLT_MAX))
         return;
+    bool inside, at_corner = false;
     for (int k = 0; k < 3; k++)
+        at_corner |= v[k]->i == x && v[k]->j == y;
+    for (int k = 0; at_corner && !self->placed && k < 3; k++)
         if (v[k]->i == x && v[k]->j == y) { /* not by way of rounded places */
             note(&band->errors[at], fabs((double)v[k]->z - (double)band->heights[at]));
             return;
         }
-    bool inside;
     double up = distance_up(c, normal, &band->places[at], &inside) / self->source->info.georef.height_unit;
-    if (inside || isnan(up))
+    if (inside || at_corner || isnan(up))
         note(&band->errors[at], fabs(up));
     else if (covers(v, x, y))
         note(&band->beside[at], fabs(up));
@@ -384,13 +426,18 @@ static tl_status make_bent(verifier *self, unsigned workers, tl_error *error)
         self->beside[i] = tl_alloc_grid(self->width, self->band_rows, sizeof **self->beside);
         if (!self->places[i] || !self->beside[i])
             return tl_fail_memory(error, "the mesh's verification");
-        self->spaces[i] = dem_space_create(&info->georef, self->width, self->height, info->name, error);
+        self->spaces[i] = self->placed ? dem_space_create_at(&info->georef, self->placed->origin, info->name, error)
+                                       : dem_space_create(&info->georef, self->width, self->height, info->name, error);
         if (!self->spaces[i])
             return TL_ERROR_DATA;
     }
     for (size_t k = 0; k < self->mesh->vertex_count; k++) {
         const tl_vertex *v = &self->mesh->vertices[k];
-        dem_space_at(self->spaces[0], v->i, v->j, info->georef.height_unit * (double)v->z, self->corners[k].at, NULL);
+        if (self->placed)
+            memcpy(self->corners[k].at, self->placed->at[k], sizeof self->corners[k].at);
+        else
+            dem_space_at(self->spaces[0], v->i, v->j, info->georef.height_unit * (double)v->z, self->corners[k].at,
+                         NULL);
     }
     return TL_OK;
 }
@@ -454,7 +501,14 @@ tl_status tl_mesh_verify(const tl_mesh *mesh, const tl_source *source, const tl_
 tl_status tl_mesh_verify_in(const tl_mesh *mesh, const tl_source *source, tl_frame frame, const tl_run *run,
                             tl_mesh_report *out, tl_error *error)
 {
-    verifier self = {.mesh = mesh, .source = source, .width = source->info.width, .height = source->info.height};
+    return dem_verify_placed(mesh, NULL, source, frame, run, out, error);
+}
+
+tl_status dem_verify_placed(const tl_mesh *mesh, const dem_placed *placed, const tl_source *source, tl_frame frame,
+                            const tl_run *run, tl_mesh_report *out, tl_error *error)
+{
+    verifier self = {
+        .mesh = mesh, .placed = placed, .source = source, .width = source->info.width, .height = source->info.height};
     tl_status status = check_mesh(&self, error);
     if (status != TL_OK)
         return status;

@@ -598,6 +598,11 @@ TL_API tl_status tl_write_grid(const tl_source *source, const char *path, const 
  * its first vertex, which its header names: single precision is too coarse for them. */
 TL_API tl_status tl_write_mesh(const tl_mesh *mesh, const char *path, const tl_write_options *options, tl_error *error);
 
+/* Reads back the file that tl_write_mesh made of `mesh` in `frame`, and compares it with every sample of the source as
+ * tl_mesh_verify_in does, but with the numbers that the file has. Triangles that are upright or look down, walls and
+ * floors, count for nothing. TL_ERROR_DATA where the file is not such a mesh. */
+TL_API tl_status tl_mesh_verify_file(const char *path, const tl_mesh *mesh, const tl_source *source, tl_frame frame,
+                                     const tl_run *run, tl_mesh_report *out, tl_error *error);
 /* Writes an error pyramid to `path` as a GeoTIFF of bytes, or of floats where it is exact. */
 TL_API tl_status tl_pyramid_save(const tl_pyramid *pyramid, const char *path, const tl_write_options *options,
                                  tl_error *error);

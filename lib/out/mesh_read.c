@@ -1,0 +1,328 @@
+#include "lib/out/mesh_read.h"
+
+#include "lib/base/error.h"
+#include "lib/base/size.h"
+
+#include <jansson.h>
+
+#include <errno.h>
+#include <math.h>
+#include <stdio.h>
+#include <string.h>
+
+enum {
+    GLB_MAGIC = 0x46546c67,
+    CHUNK_JSON = 0x4e4f534a,
+    CHUNK_BINARY = 0x004e4942,
+    COMPONENT_U32 = 5125,
+    COMPONENT_FLOAT = 5126
+};
+
+/* A file's bytes, ended by a zero, and what has been read of them. */
+typedef struct bytes {
+    const char *path;
+    unsigned char *all;
+    size_t count, at;
+} bytes;
+
+static tl_status malformed(const bytes *in, const char *what, tl_error *error)
+{
+    return tl_fail(error, TL_ERROR_DATA, "%s: %s; not a mesh as talus writes it", in->path, what);
+}
+
+static tl_status read_all(const char *path, bytes *out, tl_error *error)
+{
+    FILE *file = fopen(path, "rb");
+    long size = -1;
+    *out = (bytes){.path = path};
+    if (file && fseek(file, 0, SEEK_END) == 0)
+        size = ftell(file);
+    out->all = size >= 0 ? malloc((size_t)size + 1) : NULL;
+    bool good = out->all && fseek(file, 0, SEEK_SET) == 0 && fread(out->all, 1, (size_t)size, file) == (size_t)size;
+    int code = errno;
+    if (file)
+        fclose(file);
+    if (!good) {
+        free(out->all);
+        return file && size >= 0 && !out->all ? tl_fail_memory(error, path) : tl_fail_system(error, path, "read", code);
+    }
+    out->count = (size_t)size;
+    out->all[size] = 0;
+    return TL_OK;
+}
+
+static bool make_room(out_mesh_file *out)
+{
+    size_t corners;
+    if (out->vertex_count > UINT32_MAX || !tl_size_mul(out->triangle_count, 3, &corners))
+        return false;
+    out->xyz = tl_alloc(out->vertex_count, sizeof *out->xyz);
+    out->indices = tl_alloc(corners, sizeof *out->indices);
+    return out->xyz && out->indices;
+}
+
+static bool indices_good(const out_mesh_file *mesh)
+{
+    for (size_t k = 0; k < 3 * mesh->triangle_count; k++)
+        if (mesh->indices[k] >= mesh->vertex_count)
+            return false;
+    return true;
+}
+
+static uint32_t word_at(const unsigned char *from)
+{
+    return (uint32_t)from[0] | (uint32_t)from[1] << 8 | (uint32_t)from[2] << 16 | (uint32_t)from[3] << 24;
+}
+
+static double float_at(const unsigned char *from)
+{
+    uint32_t bits = word_at(from);
+    float value;
+    memcpy(&value, &bits, sizeof value);
+    return (double)value;
+}
+
+static double double_at(const unsigned char *from)
+{
+    uint64_t bits = word_at(from) | (uint64_t)word_at(from + 4) << 32;
+    double value;
+    memcpy(&value, &bits, sizeof value);
+    return value;
+}
+
+/* ---- PLY ---- */
+
+/* Takes a line of the header, without its end; false: there is none. */
+static bool take_line(bytes *in, char *line, size_t room)
+{
+    size_t used = 0;
+    while (in->at < in->count && in->all[in->at] != '\n') {
+        if (used + 1 < room)
+            line[used++] = (char)in->all[in->at];
+        in->at++;
+    }
+    line[used] = 0;
+    return in->at++ < in->count;
+}
+
+/* Reads the header; *wide becomes whether coordinates are doubles. */
+static bool read_ply_header(bytes *in, out_mesh_file *out, bool *wide)
+{
+    static const char *const rest[] = {"property list uchar uint vertex_indices", "end_header"};
+    char line[512], type[16];
+    if (!take_line(in, line, sizeof line) || strcmp(line, "ply") != 0)
+        return false;
+    if (!take_line(in, line, sizeof line) || strcmp(line, "format binary_little_endian 1.0") != 0)
+        return false;
+    do {
+        if (!take_line(in, line, sizeof line))
+            return false;
+    } while (strncmp(line, "comment", 7) == 0);
+    if (sscanf(line, "element vertex %zu", &out->vertex_count) != 1)
+        return false;
+    for (int a = 0; a < 3; a++) {
+        char name;
+        if (!take_line(in, line, sizeof line) || sscanf(line, "property %15s %c", type, &name) != 2 || name != "xyz"[a])
+            return false;
+        bool doubles = strcmp(type, "double") == 0;
+        if ((!doubles && strcmp(type, "float") != 0) || (a && doubles != *wide))
+            return false;
+        *wide = doubles;
+    }
+    if (!take_line(in, line, sizeof line) || sscanf(line, "element face %zu", &out->triangle_count) != 1)
+        return false;
+    for (int i = 0; i < 2; i++)
+        if (!take_line(in, line, sizeof line) || strcmp(line, rest[i]) != 0)
+            return false;
+    return true;
+}
+
+static tl_status read_ply(bytes *in, out_mesh_file *out, tl_error *error)
+{
+    enum { FACE = 13 };
+    bool wide = false;
+    if (!read_ply_header(in, out, &wide))
+        return malformed(in, "its header", error);
+    size_t size = wide ? 24 : 12, left = in->count - in->at, vertex_bytes, face_bytes;
+    if (!tl_size_mul(out->vertex_count, size, &vertex_bytes) || !tl_size_mul(out->triangle_count, FACE, &face_bytes) ||
+        vertex_bytes > left || left - vertex_bytes != face_bytes)
+        return malformed(in, "its length", error);
+    if (!make_room(out))
+        return tl_fail_memory(error, in->path);
+    const unsigned char *from = in->all + in->at;
+    for (size_t k = 0; k < out->vertex_count; k++, from += size)
+        for (int a = 0; a < 3; a++)
+            out->xyz[k][a] = wide ? double_at(from + 8 * a) : float_at(from + 4 * a);
+    for (size_t t = 0; t < out->triangle_count; t++, from += FACE) {
+        if (*from != 3)
+            return malformed(in, "a face that is no triangle", error);
+        for (size_t k = 0; k < 3; k++)
+            out->indices[3 * t + k] = word_at(from + 1 + 4 * k);
+    }
+    return TL_OK;
+}
+
+/* ---- OBJ ---- */
+
+static tl_status read_obj(bytes *in, out_mesh_file *out, tl_error *error)
+{
+    for (size_t i = 0; i < in->count; i++)
+        if (i == 0 || in->all[i - 1] == '\n') {
+            out->vertex_count += in->all[i] == 'v' && in->all[i + 1] == ' ';
+            out->triangle_count += in->all[i] == 'f' && in->all[i + 1] == ' ';
+        }
+    if (!make_room(out))
+        return tl_fail_memory(error, in->path);
+    size_t v = 0, f = 0;
+    for (char *line = (char *)in->all; line; line = strchr(line, '\n')) {
+        line += *line == '\n';
+        if (line[0] == 'v' && line[1] == ' ') {
+            char *at = line + 1;
+            for (int a = 0; a < 3; a++)
+                out->xyz[v][a] = strtod(at, &at);
+            v++;
+        } else if (line[0] == 'f' && line[1] == ' ') {
+            char *at = line + 1;
+            for (size_t k = 0; k < 3; k++) {
+                unsigned long long index = strtoull(at, &at, 10);
+                out->indices[3 * f + k] = index > 0 && index <= UINT32_MAX ? (uint32_t)(index - 1) : UINT32_MAX;
+            }
+            f++;
+        }
+    }
+    /* a zero byte within ends the text early */
+    return v == out->vertex_count && f == out->triangle_count ? TL_OK : malformed(in, "its lines", error);
+}
+
+/* ---- STL ---- */
+
+static tl_status read_stl(bytes *in, out_mesh_file *out, tl_error *error)
+{
+    enum { HEAD = 84, RECORD = 50 };
+    if (in->count < HEAD || (in->count - HEAD) % RECORD || word_at(in->all + HEAD - 4) != (in->count - HEAD) / RECORD)
+        return malformed(in, "its length", error);
+    out->triangle_count = (in->count - HEAD) / RECORD;
+    out->vertex_count = 3 * out->triangle_count;
+    if (!make_room(out))
+        return tl_fail_memory(error, in->path);
+    char head[HEAD - 3] = {0};
+    double origin[3] = {0}; /* what was taken off a map's coordinates, which single precision cannot hold */
+    memcpy(head, in->all, HEAD - 4);
+    const char *from_text = strstr(head, " projected from ");
+    if (from_text && sscanf(from_text, " projected from %lf %lf", &origin[0], &origin[1]) != 2)
+        return malformed(in, "its header", error);
+    for (size_t k = 0; k < out->vertex_count; k++) {
+        const unsigned char *from = in->all + HEAD + k / 3 * RECORD + 12 + k % 3 * 12;
+        for (int a = 0; a < 3; a++)
+            out->xyz[k][a] = float_at(from + 4 * a) + origin[a];
+        out->indices[k] = (uint32_t)k;
+    }
+    return TL_OK;
+}
+
+/* ---- GLB ---- */
+
+static json_t *item_of(json_t *root, const char *list, size_t index)
+{
+    return json_array_get(json_object_get(root, list), index);
+}
+
+static size_t size_of(json_t *object, const char *name)
+{
+    json_int_t value = json_integer_value(json_object_get(object, name));
+    return value > 0 ? (size_t)value : 0;
+}
+
+/* Where an accessor's items lie: `stride` from one to the next, the last of them within the binary chunk. */
+static const unsigned char *find_items(json_t *root, size_t index, int component, size_t size, const bytes *binary,
+                                       size_t *count, size_t *stride)
+{
+    json_t *accessor = item_of(root, "accessors", index);
+    json_t *view = item_of(root, "bufferViews", size_of(accessor, "bufferView"));
+    size_t start = size_of(view, "byteOffset"), offset = size_of(accessor, "byteOffset"), span;
+    *count = size_of(accessor, "count");
+    *stride = json_object_get(view, "byteStride") ? size_of(view, "byteStride") : size;
+    if (!accessor || !view || (int)size_of(accessor, "componentType") != component || *stride < size || !*count)
+        return NULL;
+    if (!tl_size_mul(*count - 1, *stride, &span) || start > binary->count || offset > binary->count - start ||
+        span > binary->count - start - offset || size > binary->count - start - offset - span)
+        return NULL;
+    return binary->all + start + offset;
+}
+
+static tl_status take_glb(json_t *root, const bytes *binary, out_mesh_file *out, tl_error *error)
+{
+    json_t *node = item_of(root, "nodes", 0), *mesh = item_of(root, "meshes", size_of(node, "mesh"));
+    json_t *primitive = item_of(mesh, "primitives", 0), *attributes = json_object_get(primitive, "attributes");
+    json_t *translation = json_object_get(node, "translation");
+    size_t stride, corners, index_stride;
+    const unsigned char *at =
+        find_items(root, size_of(attributes, "POSITION"), COMPONENT_FLOAT, 12, binary, &out->vertex_count, &stride);
+    const unsigned char *index =
+        find_items(root, size_of(primitive, "indices"), COMPONENT_U32, 4, binary, &corners, &index_stride);
+    if (!at || !index || corners % 3 || !json_object_get(attributes, "POSITION"))
+        return malformed(binary, "its accessors", error);
+    out->triangle_count = corners / 3;
+    if (!make_room(out))
+        return tl_fail_memory(error, binary->path);
+    for (size_t k = 0; k < out->vertex_count; k++, at += stride) {
+        double y_up[3];
+        for (int a = 0; a < 3; a++)
+            y_up[a] = float_at(at + 4 * a) + json_number_value(json_array_get(translation, (size_t)a));
+        out->xyz[k][0] = y_up[0], out->xyz[k][1] = -y_up[2], out->xyz[k][2] = y_up[1];
+    }
+    for (size_t k = 0; k < corners; k++)
+        out->indices[k] = word_at(index + k * index_stride);
+    return TL_OK;
+}
+
+static tl_status read_glb(bytes *in, out_mesh_file *out, tl_error *error)
+{
+    if (in->count < 20 || word_at(in->all) != GLB_MAGIC || word_at(in->all + 16) != CHUNK_JSON)
+        return malformed(in, "its header", error);
+    size_t text = word_at(in->all + 12);
+    if (text > in->count - 20 || in->count - 20 - text < 8 || word_at(in->all + 24 + text) != CHUNK_BINARY)
+        return malformed(in, "its chunks", error);
+    bytes binary = {in->path, in->all + 28 + text, word_at(in->all + 20 + text), 0};
+    if (binary.count > in->count - 28 - text)
+        return malformed(in, "its length", error);
+    json_t *root = json_loadb((const char *)in->all + 20, text, 0, NULL);
+    tl_status status = root ? take_glb(root, &binary, out, error) : malformed(in, "its JSON", error);
+    json_decref(root);
+    return status;
+}
+
+/* ---- Any ---- */
+
+void out_mesh_free(out_mesh_file *file)
+{
+    free(file->xyz);
+    free(file->indices);
+    *file = (out_mesh_file){0};
+}
+
+tl_status out_mesh_read(const char *path, out_mesh_file *out, tl_error *error)
+{
+    static const struct {
+        const char *ending;
+        tl_status (*read)(bytes *, out_mesh_file *, tl_error *);
+    } readers[] = {{"ply", read_ply}, {"obj", read_obj}, {"glb", read_glb}, {"stl", read_stl}};
+    const tl_format *format = tl_format_of(path);
+    bytes in;
+    *out = (out_mesh_file){0};
+    for (size_t i = 0; i < sizeof readers / sizeof *readers; i++) {
+        if (!format || strcmp(format->ending, readers[i].ending) != 0)
+            continue;
+        tl_status status = read_all(path, &in, error);
+        if (status != TL_OK)
+            return status;
+        status = readers[i].read(&in, out, error);
+        if (status == TL_OK && !indices_good(out))
+            status = malformed(&in, "a triangle of vertices that are not there", error);
+        free(in.all);
+        if (status != TL_OK)
+            out_mesh_free(out);
+        return status;
+    }
+    return tl_fail(error, TL_ERROR_ARGUMENT, "%s: only .glb, .obj, .ply and .stl can be read back", path);
+}

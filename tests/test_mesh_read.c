@@ -1,0 +1,185 @@
+#define _GNU_SOURCE /* mkdtemp */
+#include "lib/out/mesh_read.h"
+#include "lib/talus.h"
+
+#include <math.h>
+#include <setjmp.h>
+#include <stdarg.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <unistd.h>
+
+#include <cmocka.h>
+
+#include "tests/grids.h"
+
+static char folder[] = "/tmp/talus-test-XXXXXX";
+static const char *const endings[] = {"ply", "obj", "glb", "stl"};
+
+static int make_folder(void **state)
+{
+    (void)state;
+    return mkdtemp(folder) ? 0 : -1;
+}
+
+static int remove_folder(void **state)
+{
+    (void)state;
+    return rmdir(folder);
+}
+
+static const char *path_of(const char *ending)
+{
+    static char path[64];
+    snprintf(path, sizeof path, "%s/mesh.%s", folder, ending);
+    return path;
+}
+
+static tl_source *open_hills(grid *of, bool holes)
+{
+    *of = make_grid(60, 40, TERRAIN_EIGHTHS, holes ? VOIDS_FEW : VOIDS_NONE);
+    tl_source *source = open_grid(of);
+    const double transform[6] = {356000.25, 2, 0, 5699000.5, 0, -3};
+    memcpy(source->info.georef.transform, transform, sizeof transform);
+    source->info.georef.located = true;
+    return source;
+}
+
+static tl_mesh *write_mesh(const tl_source *source, double max_error, const char *path, tl_frame frame)
+{
+    tl_framework *framework = tl_framework_build(source, &(tl_framework_options){.max_error = max_error}, NULL);
+    tl_mesh *mesh = NULL;
+    tl_error error = {0};
+    assert_int_equal(tl_framework_mesh(framework, &mesh, NULL), TL_OK);
+    tl_write_options options = {.overwrite = true, .frame = frame};
+    if (tl_write_mesh(mesh, path, &options, &error) != TL_OK)
+        fail_msg("%s", error.text);
+    tl_framework_destroy(framework);
+    return mesh;
+}
+
+/* The file has the error that the mesh has, but for what rounding of its numbers adds. */
+static void filesAreAsFarFromTheDemAsTheirMeshes(void **state)
+{
+    static const tl_frame frames[] = {TL_FRAME_PIXEL, TL_FRAME_PROJECTED};
+    (void)state;
+    for (int round = 0; round < 16; round++) {
+        grid of;
+        random_state = (uint64_t)round;
+        tl_source *source = open_hills(&of, round & 8);
+        const char *path = path_of(endings[round & 3]);
+        tl_frame frame = frames[round >> 2 & 1];
+        tl_mesh *mesh = write_mesh(source, 3, path, frame);
+        tl_mesh_report own, read;
+        tl_error error = {0};
+        assert_int_equal(tl_mesh_verify(mesh, source, NULL, &own, NULL), TL_OK);
+        if (tl_mesh_verify_file(path, mesh, source, frame, NULL, &read, &error) != TL_OK)
+            fail_msg("%s", error.text);
+        /* floats of a map's offsets below 256 round by 2^-17, over slopes below 70 in a cell of 2 */
+        assert_true(fabs(read.max_error - own.max_error) <= (frame == TL_FRAME_PIXEL ? 0 : 2 * 70 * 0x1p-17));
+        assert_int_equal(read.samples, own.samples);
+        assert_int_equal(read.uncovered, own.uncovered);
+        tl_mesh_destroy(mesh);
+        tl_source_destroy(source);
+        assert_int_equal(unlink(path), 0);
+        free(of.z);
+    }
+}
+
+/* A vertex that is off in the file, which the mesh in memory does not know. */
+static void filesTellWhatMemoryDoesNot(void **state)
+{
+    grid of;
+    (void)state;
+    random_state = 3;
+    tl_source *source = open_hills(&of, false);
+    const char *path = path_of("ply");
+    tl_mesh *mesh = write_mesh(source, 1, path, TL_FRAME_PIXEL);
+    FILE *file = fopen(path, "r+b");
+    char head[8192];
+    size_t count = fread(head, 1, sizeof head - 1, file);
+    head[count] = 0;
+    char *end = strstr(head, "end_header\n");
+    assert_non_null(end);
+    float z = 1e4f;
+    assert_int_equal(fseek(file, end + 11 - head + 12 * 7 + 8, SEEK_SET), 0);
+    assert_int_equal(fwrite(&z, sizeof z, 1, file), 1);
+    fclose(file);
+    tl_mesh_report read;
+    assert_int_equal(tl_mesh_verify_file(path, mesh, source, TL_FRAME_PIXEL, NULL, &read, NULL), TL_OK);
+    assert_true(read.max_error > 9000);
+    tl_mesh_destroy(mesh);
+    tl_source_destroy(source);
+    assert_int_equal(unlink(path), 0);
+    free(of.z);
+}
+
+static size_t load(const char *path, unsigned char **bytes)
+{
+    FILE *file = fopen(path, "rb");
+    assert_non_null(file);
+    fseek(file, 0, SEEK_END);
+    size_t count = (size_t)ftell(file);
+    *bytes = malloc(count + 1);
+    rewind(file);
+    assert_int_equal(fread(*bytes, 1, count, file), count);
+    fclose(file);
+    return count;
+}
+
+static void store(const char *path, const unsigned char *bytes, size_t count)
+{
+    FILE *file = fopen(path, "wb");
+    assert_non_null(file);
+    assert_int_equal(fwrite(bytes, 1, count, file), count);
+    assert_int_equal(fclose(file), 0);
+}
+
+/* Damaged files are read, or refused by a line that names them; never worse, and never triangles of nothing. */
+static void damagedFilesAreRefusedOrRead(void **state)
+{
+    (void)state;
+    for (int kind = 0; kind < 4; kind++) {
+        grid of;
+        random_state = (uint64_t)kind;
+        tl_source *source = open_hills(&of, false);
+        const char *path = path_of(endings[kind]);
+        tl_mesh_destroy(write_mesh(source, 8, path, TL_FRAME_PROJECTED));
+        unsigned char *bytes;
+        size_t count = load(path, &bytes), refused = 0;
+        for (int round = 0; round < 600; round++) {
+            size_t kept = round % 3 ? count : (size_t)(random_bits() % (count + 1));
+            size_t at = (size_t)(random_bits() % (round % 2 ? count : 1000 < count ? 1000 : count));
+            unsigned char before = bytes[at];
+            bytes[at] = (unsigned char)random_bits();
+            store(path, bytes, kept);
+            bytes[at] = before;
+            out_mesh_file file;
+            tl_error error = {0};
+            if (out_mesh_read(path, &file, &error) != TL_OK) {
+                assert_non_null(strstr(error.text, path));
+                refused++;
+                continue;
+            }
+            for (size_t k = 0; k < 3 * file.triangle_count; k++)
+                assert_true(file.indices[k] < file.vertex_count);
+            out_mesh_free(&file);
+        }
+        assert_true(refused > 50);
+        free(bytes);
+        tl_source_destroy(source);
+        assert_int_equal(unlink(path), 0);
+        free(of.z);
+    }
+}
+
+int main(void)
+{
+    const struct CMUnitTest tests[] = {
+        cmocka_unit_test(filesAreAsFarFromTheDemAsTheirMeshes),
+        cmocka_unit_test(filesTellWhatMemoryDoesNot),
+        cmocka_unit_test(damagedFilesAreRefusedOrRead),
+    };
+    return cmocka_run_group_tests(tests, make_folder, remove_folder);
+}
