@@ -82,9 +82,19 @@ static void inspect(builder *self)
         self->rim_voids |= isnan(self->heights[y * self->width]) || isnan(self->heights[(y + 1) * self->width - 1]);
 }
 
+/* Whether the heights and so many bytes beside them are within what the run may take. */
+static tl_status run_fits(const builder *self, double bytes, tl_error *error)
+{
+    double heights = (double)sizeof(float) * (double)self->width * (double)self->height;
+    return tl_run_fits(self->options->run, heights + bytes, self->dem->info.name, "simplifying it", error);
+}
+
 static tl_status read_dem(builder *self, tl_error *error)
 {
     const tl_run *run = self->options->run;
+    tl_status fits = run_fits(self, 0, error);
+    if (fits != TL_OK)
+        return fits;
     self->heights = tl_alloc_grid(self->width, self->height, sizeof *self->heights);
     if (!self->heights)
         return tl_fail(error, TL_ERROR_MEMORY, "%s: not enough memory for its %lld x %lld samples",
@@ -163,7 +173,11 @@ static tl_status start_inside(builder *self, tl_error *error)
         .max_error = self->options->max_error * self->share, .frame = self->options->frame, .run = &quiet};
     tl_framework *framework = tl_framework_build(&source.source, &options, error);
     tl_mesh *mesh = NULL;
-    tl_status status = framework ? tl_framework_mesh(framework, &mesh, error) : TL_ERROR_DATA;
+    tl_status status = framework ? TL_OK : error->status;
+    if (framework) /* less than two triangles a vertex */
+        status = run_fits(self, (sizeof(tl_vertex) + 24.0) * (double)tl_framework_point_count(framework), error);
+    if (status == TL_OK)
+        status = tl_framework_mesh(framework, &mesh, error);
     tl_framework_destroy(framework);
     if (mesh)
         take_mesh(self, mesh);
@@ -451,7 +465,7 @@ static tl_status make_workers(step *r, unsigned workers, tl_error *error)
         r->spaces[k] =
             r->ground.bends ? dem_space_create(&info->georef, info->width, info->height, info->name, error) : NULL;
         if (r->ground.bends && !r->spaces[k])
-            return TL_ERROR_DATA;
+            return error->status;
     }
     return r->patches && r->spaces ? TL_OK : tl_fail_memory(error, "the mesh");
 }
@@ -468,6 +482,15 @@ static void free_workers(step *r, unsigned workers)
     free(r->spaces);
 }
 
+/* The mesh twice over, a mark for each vertex, and what the workers need for a window: 16 bytes a sample and some 190 a
+ * vertex. */
+static tl_status collapse_fits(const builder *self, unsigned workers, tl_error *error)
+{
+    const double side = (WINDOW + 4.0) * (WINDOW + 4.0), vertices = (double)self->soup.vertex_count;
+    double patches = workers * (16 * side + 190 * fmin(vertices, side));
+    return run_fits(self, 24.0 * (double)self->soup.triangle_count + 13 * vertices + patches, error);
+}
+
 static tl_status collapse_all(builder *self, bool bends, tl_error *error)
 {
     const tl_run *run = self->options->run;
@@ -479,13 +502,16 @@ static tl_status collapse_all(builder *self, bool bends, tl_error *error)
                                .max_error = self->options->max_error,
                                .rounding = self->exact ? 0 : tl_plane_rounding(self->magnitude),
                                .bends = bends};
+    unsigned workers = tl_parallel_workers(run, windows - 1);
+    tl_status status = collapse_fits(self, workers, error);
+    if (status != TL_OK)
+        return status;
     r.triangles = tl_alloc(self->soup.triangle_count, 3 * sizeof *r.triangles);
     r.first = tl_alloc(windows, sizeof *r.first);
     r.counts = tl_alloc(windows, sizeof *r.counts);
     self->settled = calloc(self->soup.vertex_count + 1, sizeof *self->settled);
-    unsigned workers = tl_parallel_workers(run, windows - 1);
-    tl_status status = r.triangles && r.first && r.counts && self->settled ? make_workers(&r, workers, error)
-                                                                           : tl_fail_memory(error, "the mesh");
+    bool made = r.triangles && r.first && r.counts && self->settled;
+    status = made ? make_workers(&r, workers, error) : tl_fail_memory(error, "the mesh");
     for (int k = 0; k < PHASES && status == TL_OK; k++) {
         r.shape = &phases[k];
         status = run_phase(&r, run, error);
@@ -559,7 +585,7 @@ static tl_status look_at_frame(builder *self, tl_error *error)
     const tl_source_info *info = &self->dem->info;
     self->space = dem_space_create(&info->georef, self->width, self->height, info->name, error);
     if (!self->space)
-        return TL_ERROR_DATA;
+        return error->status;
     self->bend = dem_space_bend(self->space, 0, 0, (double)(self->width - 1), (double)(self->height - 1), self->top);
     look_at_rim(self);
     return TL_OK;
@@ -621,7 +647,7 @@ static tl_status simplify_plainly(const tl_source *dem, const tl_simplify_option
 {
     tl_framework_options plain = {.max_error = options->max_error, .frame = options->frame, .run = options->run};
     tl_framework *framework = tl_framework_build(dem, &plain, error);
-    tl_status status = framework ? tl_framework_mesh(framework, out, error) : TL_ERROR_DATA;
+    tl_status status = framework ? tl_framework_mesh(framework, out, error) : error->status;
     if (status == TL_OK && uncovered)
         *uncovered = tl_framework_isolated_count(framework);
     tl_framework_destroy(framework);
@@ -654,6 +680,8 @@ static tl_status count_uncovered(const builder *self, const tl_mesh *mesh, uint6
 tl_status tl_simplify(const tl_source *dem, const tl_simplify_options *options, tl_mesh **out, uint64_t *uncovered,
                       tl_error *error)
 {
+    tl_error own;
+    error = error ? error : &own; /* it tells why a framework is none */
     bool cells = dem->info.width > 1 && dem->info.height > 1;
     if (!cells || (options->kind == TL_MESH_QUADTREE && !options->canonical_borders))
         return simplify_plainly(dem, options, out, uncovered, error);

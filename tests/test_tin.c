@@ -493,6 +493,26 @@ static void stopsWhenCancelled(void **state)
     free(of.z);
 }
 
+static void refusesWhatDoesNotFitIntoTheMemoryGiven(void **state)
+{
+    (void)state;
+    random_state = 9;
+    grid of = make_grid(200, 200, TERRAIN_NOISE, VOIDS_NONE);
+    tl_source *source = open_grid(&of);
+    static const size_t few[] = {1, 40000, 4 * 40000, 40 * 40000};
+    for (size_t k = 0; k < 4; k++) { /* for nothing, for heights in part, for no mesh, for no collapse */
+        tl_run run = {.threads = 1, .memory = few[k]};
+        tl_mesh *mesh = NULL;
+        tl_error error = {0};
+        tl_simplify_options options = {.max_error = 0.1, .kind = TL_MESH_TIN, .run = &run};
+        assert_int_equal(tl_simplify(source, &options, &mesh, NULL, &error), TL_ERROR_MEMORY);
+        assert_null(mesh);
+        assert_non_null(strstr(error.text, "MB"));
+    }
+    tl_source_destroy(source);
+    free(of.z);
+}
+
 int main(void)
 {
     const struct CMUnitTest tests[] = {
@@ -501,7 +521,7 @@ int main(void)
         cmocka_unit_test(planeTakesNoMoreThanItsRim),   cmocka_unit_test(tinIsSmallerThanQuadtree),
         cmocka_unit_test(tilesJoinWithoutACrack),       cmocka_unit_test(wideTilesJoinWithoutACrack),
         cmocka_unit_test(keepsBoundInEnuFrames),        cmocka_unit_test(refusesBoundsThatAreNone),
-        cmocka_unit_test(stopsWhenCancelled),
+        cmocka_unit_test(stopsWhenCancelled),           cmocka_unit_test(refusesWhatDoesNotFitIntoTheMemoryGiven),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }
