@@ -94,6 +94,13 @@ static bool by_pyramid(const settings *set)
     return set->triangles || set->vertices || set->share > 0 || set->error_cache;
 }
 
+/* Whether the DEM's heights are too many to be held, which a pyramid need not do. */
+static bool too_large(const settings *set, const tl_source *dem, const tl_run *run)
+{
+    double bytes = 5 * (double)dem->info.width * (double)dem->info.height;
+    return set->mesh == TL_MESH_QUADTREE && set->borders == BORDERS_FREE && run->memory && bytes > (double)run->memory;
+}
+
 /* The pyramid from the cache, where it fits the DEM; *status tells why there is none. */
 static tl_pyramid *load_pyramid(const settings *set, const tl_source *dem, const tl_pyramid_options *options,
                                 tl_status *status, tl_error *error)
@@ -114,7 +121,9 @@ static tl_pyramid *load_pyramid(const settings *set, const tl_source *dem, const
 
 static tl_pyramid *make_pyramid(const settings *set, const tl_source *dem, const tl_run *run, tl_error *error)
 {
-    tl_pyramid_options options = {.frame = (tl_frame)set->frame, .run = run};
+    tl_pyramid_options options = {.frame = (tl_frame)set->frame,
+                                  .rounding = tl_write_rounding(&dem->info, set->common.output, (tl_frame)set->frame),
+                                  .run = run};
     tl_write_options writing = {.overwrite = true, .run = run};
     tl_status status;
     tl_pyramid *pyramid = load_pyramid(set, dem, &options, &status, error);
@@ -152,10 +161,11 @@ static tl_status select_mesh(settings *set, const tl_source *dem, const tl_run *
 static tl_status make_mesh(settings *set, const tl_source *dem, const tl_run *run, tl_mesh **mesh, uint64_t *isolated,
                            tl_error *error)
 {
-    if (by_pyramid(set))
+    if (by_pyramid(set) || too_large(set, dem, run))
         return select_mesh(set, dem, run, mesh, isolated, error);
     tl_simplify_options options = {.max_error = set->max_error,
                                    .frame = (tl_frame)set->frame,
+                                   .rounding = tl_write_rounding(&dem->info, set->common.output, (tl_frame)set->frame),
                                    .kind = (tl_mesh_kind)set->mesh,
                                    .canonical_borders = set->borders == BORDERS_CANONICAL,
                                    .run = run};

@@ -36,8 +36,9 @@ typedef struct builder {
     struct scratch *scratch; /* by worker */
     unsigned workers;
     double top;             /* the highest sample or 0, metres; where the frame bends */
-    double rises[TL_SIZES]; /* of triangles and their neighbours, metres in a cell; where the frame bends */
-    dem_space **spaces;     /* by worker, likewise */
+    double rises[TL_SIZES]; /* of triangles and their neighbours, metres in a cell; where the frame bends or rounds */
+    tl_rounding rounding;
+    dem_space **spaces; /* by worker, likewise */
 } builder;
 
 /* ---- Progress over several loops ----------------------------------------------------------------- */
@@ -184,8 +185,12 @@ static void fill_limits(const builder *self, const dem_bend *bend, double limit[
     const tl_framework *framework = self->framework;
     for (int size = 0; size < TL_SIZES; size++)
         limit[size] = framework->max_error;
-    for (int size = 1; framework->bends && size < TL_SIZES; size++)
-        limit[size] -= dem_bend_error(bend, ldexp(1, size + 1), self->rises[size]) / framework->info.georef.height_unit;
+    double unit = framework->info.georef.height_unit;
+    for (int size = 1; size < TL_SIZES; size++) {
+        if (framework->bends)
+            limit[size] -= dem_bend_error(bend, ldexp(1, size + 1), self->rises[size]) / unit;
+        limit[size] -= tl_rounding_error(&self->rounding, self->rises[size] / unit);
+    }
 }
 
 static dem_bend set_limits(const builder *self, tl_patch *patch, unsigned worker)
@@ -423,13 +428,9 @@ static void free_spaces(builder *self)
     free(self->spaces);
 }
 
-/* What the limits of a bent frame are made of. A sample is shifted over a triangle's own slope or that of the triangle
- * on the other side of one of its edges, which is of the same size or of the next. */
-static tl_status look_at_frame(builder *self, const tl_run *run, tl_error *error)
+static tl_status make_spaces(builder *self, tl_error *error)
 {
-    const tl_framework *framework = self->framework;
-    const tl_source_info *info = &framework->info;
-    double own[TL_SIZES + 1] = {0}, unit = info->georef.height_unit;
+    const tl_source_info *info = &self->framework->info;
     self->spaces = calloc(self->workers, sizeof(dem_space *));
     if (!self->spaces)
         return tl_fail_memory(error, "the framework");
@@ -438,14 +439,27 @@ static tl_status look_at_frame(builder *self, const tl_run *run, tl_error *error
         if (!self->spaces[i])
             return TL_ERROR_DATA;
     }
-    tl_status status =
-        tl_framework_rises(self->heights, self->width, self->height, framework->lattice_log, run, own, error);
+    return TL_OK;
+}
+
+/* What the limits of a frame that is bent or rounded are made of. A sample is shifted over a triangle's own slope or
+ * that of the triangle on the other side of one of its edges, which is of the same size or of the next. */
+static tl_status look_at_frame(builder *self, const tl_run *run, tl_error *error)
+{
+    const tl_framework *framework = self->framework;
+    double own[TL_SIZES + 1] = {0}, unit = framework->info.georef.height_unit;
+    tl_status status = framework->bends ? make_spaces(self, error) : TL_OK;
+    if (status == TL_OK)
+        status = tl_framework_rises(self->heights, self->width, self->height, framework->lattice_log, run, own, error);
     for (int size = 1; size < TL_SIZES; size++)
         self->rises[size] = unit * fmax(own[size], fmax(own[size - 1], own[size + 1]));
-    float top = 0;
-    for (int64_t i = 0; i < self->width * self->height; i++)
+    float low = 0, top = 0; /* sea level is among the heights, as where a frame has its origin may be */
+    for (int64_t i = 0; i < self->width * self->height; i++) {
         top = self->heights[i] > top ? self->heights[i] : top; /* false for a void */
+        low = self->heights[i] < low ? self->heights[i] : low;
+    }
     self->top = unit * (double)top;
+    self->rounding.upright += self->rounding.of_range * ((double)top - (double)low);
     return status;
 }
 
@@ -463,7 +477,7 @@ static tl_status decide_blocks(builder *self, const tl_run *run, tl_error *error
         self->centres[i] = -INFINITY;
     self->workers = tl_parallel_workers(run, blocks);
     tl_status status = make_scratch(self, error);
-    if (status == TL_OK && framework->bends)
+    if (status == TL_OK && (framework->bends || tl_rounds(&self->rounding)))
         status = look_at_frame(self, run, error);
     if (status == TL_OK)
         status = tl_parallel_for(run, blocks, (uint64_t)self->width * (uint64_t)self->height, run_block, self, error);
@@ -567,7 +581,11 @@ tl_framework *tl_framework_build(const tl_source *dem, const tl_framework_option
     if (!framework)
         return NULL;
     framework->bends = dem_frame_bends(&dem->info.georef, options->frame);
-    builder self = {.framework = framework, .dem = dem, .width = dem->info.width, .height = dem->info.height};
+    builder self = {.framework = framework,
+                    .dem = dem,
+                    .width = dem->info.width,
+                    .height = dem->info.height,
+                    .rounding = options->rounding};
     tl_status status = build(&self, options->run, error);
     free(self.heights);
     free(self.found);

@@ -185,4 +185,16 @@ static inline double tl_error_rounding(double magnitude)
     return magnitude * ((80 + 4 * (TL_BLOCK / 4)) * 0x1p-53);
 }
 
+static inline bool tl_rounds(const tl_rounding *rounding)
+{
+    return rounding->along > 0 || rounding->upright > 0 || rounding->of_range > 0;
+}
+
+/* What rounded corners add to the error of a triangle that rises by `rise` in a cell, units of height: the plane is
+ * lifted, and shifted over its slope, which has changed a little itself. What of_range adds is in `upright` already. */
+static inline double tl_rounding_error(const tl_rounding *rounding, double rise)
+{
+    return rounding->upright + 1.01 * rounding->along * rise;
+}
+
 #endif

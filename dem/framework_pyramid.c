@@ -19,6 +19,9 @@
 
 enum { FRAME = TL_BLOCK + 3, LAST = TL_BLOCK };
 
+/* Bytes a sample of the bitmaps of the pyramid's shape and of one framework. */
+static const double BITMAPS = 0.5;
+
 /* What the first pass finds of a block. */
 typedef struct block_facts {
     float magnitude, low, high; /* the latter two where it is not void */
@@ -53,6 +56,7 @@ typedef struct builder {
     double top_add[TL_SIZES]; /* of the top */
     double top_rounding;
     tl_run run;
+    tl_rounding rounding;
     bool only_looks; /* at what the checksum needs */
 } builder;
 
@@ -142,6 +146,12 @@ static void store_corners(builder *self, const block_place *at, const float *z)
                 z[j * self->side * (at->width + 1) + i * self->side];
 }
 
+/* Whether errors are more than distances from planes. */
+static bool shifts(const builder *self)
+{
+    return self->pyramid->bends || tl_rounds(&self->rounding);
+}
+
 static tl_status look_at_rises(const builder *self, const block_place *at, scratch *own, tl_error *error)
 {
     static const tl_run alone = {.threads = 1};
@@ -172,7 +182,7 @@ static tl_status look_at_block(void *context, tl_parallel *loop, uint64_t item, 
     find_range(own->read, of.width * of.height, found);
     found->rounds = tl_heights_round(&of, found->magnitude, self->shape->lattice_log);
     store_corners(self, &at, own->read);
-    return self->pyramid->bends ? look_at_rises(self, &at, own, error) : TL_OK;
+    return shifts(self) ? look_at_rises(self, &at, own, error) : TL_OK;
 }
 
 /* The rises of all triangles, of a sample's own or of the one beside it: see look_at_frame in framework.c. */
@@ -191,7 +201,9 @@ static tl_status sum_rises(builder *self, tl_error *error)
         own[size + 2 * TL_BLOCK_LOG] = top[size] / TL_BLOCK;
     for (int size = 1; size < TL_SIZES; size++)
         self->rises[size] = info->georef.height_unit * fmax(own[size], fmax(own[size - 1], own[size + 1]));
-    self->highest = info->georef.height_unit * fmax(0, (double)self->all.high);
+    double high = fmax(0, (double)self->all.high), low = fmin(0, (double)self->all.low); /* as in framework.c */
+    self->highest = info->georef.height_unit * high;
+    self->rounding.upright += self->rounding.of_range * (high - low);
     return status;
 }
 
@@ -218,8 +230,10 @@ static void fill_add(const builder *self, const dem_bend *bend, double add[TL_SI
 {
     double unit = self->shape->info.georef.height_unit;
     add[0] = 0;
-    for (int size = 1; size < TL_SIZES; size++)
+    for (int size = 1; size < TL_SIZES; size++) {
         add[size] = self->pyramid->bends ? dem_bend_error(bend, ldexp(1, size + 1), self->rises[size]) / unit : 0;
+        add[size] += tl_rounding_error(&self->rounding, self->rises[size] / unit);
+    }
 }
 
 static void bend_blocks(builder *self)
@@ -639,19 +653,29 @@ static void free_builder(builder *self)
     free(self->borders);
 }
 
-/* Where bent frames have their samples. */
-static uint64_t hash_place(uint64_t hash, const tl_georef *georef)
+static uint64_t mix_number(uint64_t hash, double number)
 {
-    double numbers[7];
-    memcpy(numbers, georef->transform, sizeof georef->transform);
-    numbers[6] = georef->height_unit;
-    for (int k = 0; k < 7; k++) {
-        uint64_t bits;
-        memcpy(&bits, &numbers[k], sizeof bits);
-        hash = mix(hash, bits);
+    uint64_t bits;
+    memcpy(&bits, &number, sizeof bits);
+    return mix(hash, bits);
+}
+
+/* What errors depend on besides heights: where bent frames have their samples, and what files round. */
+static uint64_t hash_frame(const builder *self, uint64_t hash)
+{
+    const tl_georef *georef = &self->shape->info.georef;
+    if (self->pyramid->bends) {
+        for (int k = 0; k < 6; k++)
+            hash = mix_number(hash, georef->transform[k]);
+        hash = mix_number(hash, georef->height_unit);
+        for (const char *c = tl_crs_wkt(georef->crs); *c; c++)
+            hash = mix(hash, (unsigned char)*c);
     }
-    for (const char *c = tl_crs_wkt(georef->crs); *c; c++)
-        hash = mix(hash, (unsigned char)*c);
+    if (tl_rounds(&self->rounding)) {
+        hash = mix_number(hash, self->rounding.along);
+        hash = mix_number(hash, self->rounding.upright);
+        hash = mix_number(hash, self->rounding.of_range);
+    }
     return hash;
 }
 
@@ -667,8 +691,7 @@ static tl_status look(builder *self, tl_error *error)
     if (status != TL_OK)
         return status;
     sum_facts(self);
-    self->pyramid->checksum =
-        self->pyramid->bends ? hash_place(self->all.hash, &self->shape->info.georef) : self->all.hash;
+    self->pyramid->checksum = hash_frame(self, self->all.hash);
     self->pyramid->shape->voids = self->all.voids;
     return TL_OK;
 }
@@ -680,7 +703,7 @@ static tl_status build(builder *self, tl_error *error)
     tl_status status = look(self, error);
     if (status != TL_OK || self->only_looks)
         return status;
-    if (self->pyramid->bends)
+    if (shifts(self))
         status = sum_rises(self, error);
     bend_blocks(self);
     self->top_rounding = self->all.rounds ? tl_error_rounding((double)self->all.magnitude) : 0;
@@ -697,6 +720,10 @@ static tl_status build(builder *self, tl_error *error)
 
 tl_pyramid *tl_pyramid_allocate(const tl_source_info *info, const tl_pyramid_options *options, tl_error *error)
 {
+    double samples = (double)info->width * (double)info->height;
+    if (tl_run_fits(options->run, ((options->exact ? sizeof(float) : 1) + BITMAPS) * samples, info->name,
+                    "its error pyramid", error) != TL_OK)
+        return NULL;
     tl_pyramid *pyramid = calloc(1, sizeof *pyramid);
     if (!pyramid) {
         tl_fail_memory(error, "the error pyramid");
@@ -704,11 +731,11 @@ tl_pyramid *tl_pyramid_allocate(const tl_source_info *info, const tl_pyramid_opt
     }
     pyramid->shape = tl_framework_create(info, 0, options->run, error);
     if (pyramid->shape) {
-        size_t samples = (size_t)info->width * (size_t)info->height; /* its bitmaps have an eighth */
+        size_t count = (size_t)info->width * (size_t)info->height; /* its bitmaps have an eighth */
         pyramid->frame = options->frame;
         pyramid->bends = dem_frame_bends(&info->georef, options->frame);
-        pyramid->codes = options->exact ? NULL : calloc(samples, 1);
-        pyramid->errors = options->exact ? calloc(samples, sizeof *pyramid->errors) : NULL;
+        pyramid->codes = options->exact ? NULL : calloc(count, 1);
+        pyramid->errors = options->exact ? calloc(count, sizeof *pyramid->errors) : NULL;
         if (pyramid->codes || pyramid->errors)
             return pyramid;
         tl_fail(error, TL_ERROR_MEMORY, "%s: not enough memory for the errors of its %lld x %lld samples", info->name,
@@ -718,8 +745,8 @@ tl_pyramid *tl_pyramid_allocate(const tl_source_info *info, const tl_pyramid_opt
     return NULL;
 }
 
-static tl_status run_builder(tl_pyramid *pyramid, const tl_source *dem, const tl_run *run, bool only_looks,
-                             tl_error *error)
+static tl_status run_builder(tl_pyramid *pyramid, const tl_source *dem, const tl_pyramid_options *options,
+                             bool only_looks, tl_error *error)
 {
     const tl_framework *shape = pyramid->shape;
     builder self = {.pyramid = pyramid,
@@ -730,9 +757,10 @@ static tl_status run_builder(tl_pyramid *pyramid, const tl_source *dem, const tl
                     .height = dem->info.height,
                     .side = shape->block,
                     .corner_columns = (dem->info.width - 1) / shape->block + 1,
+                    .rounding = options->rounding,
                     .only_looks = only_looks};
-    if (run)
-        self.run = *run;
+    if (options->run)
+        self.run = *options->run;
     self.workers = tl_parallel_workers(&self.run, (uint64_t)(shape->columns * shape->rows));
     bool no_cells = !shape->columns || !shape->rows;
     pyramid->shape->voids = no_cells;
@@ -741,9 +769,9 @@ static tl_status run_builder(tl_pyramid *pyramid, const tl_source *dem, const tl
     return status;
 }
 
-tl_status tl_pyramid_look(tl_pyramid *pyramid, const tl_source *dem, const tl_run *run, tl_error *error)
+tl_status tl_pyramid_look(tl_pyramid *pyramid, const tl_source *dem, const tl_pyramid_options *options, tl_error *error)
 {
-    return run_builder(pyramid, dem, run, true, error);
+    return run_builder(pyramid, dem, options, true, error);
 }
 
 tl_pyramid *tl_pyramid_create(const tl_source *dem, const tl_pyramid_options *options, tl_error *error)
@@ -751,7 +779,7 @@ tl_pyramid *tl_pyramid_create(const tl_source *dem, const tl_pyramid_options *op
     static const tl_pyramid_options defaults = {0};
     options = options ? options : &defaults;
     tl_pyramid *pyramid = tl_pyramid_allocate(&dem->info, options, error);
-    if (pyramid && run_builder(pyramid, dem, options->run, false, error) == TL_OK)
+    if (pyramid && run_builder(pyramid, dem, options, false, error) == TL_OK)
         return pyramid;
     tl_pyramid_destroy(pyramid);
     return NULL;

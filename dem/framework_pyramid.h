@@ -47,6 +47,7 @@ static inline double tl_pyramid_value(const tl_pyramid *pyramid, uint32_t key)
 tl_pyramid *tl_pyramid_allocate(const tl_source_info *info, const tl_pyramid_options *options, tl_error *error);
 
 /* Finds the checksum of the DEM, with all that the errors depend on, and whether it has voids. */
-tl_status tl_pyramid_look(tl_pyramid *pyramid, const tl_source *dem, const tl_run *run, tl_error *error);
+tl_status tl_pyramid_look(tl_pyramid *pyramid, const tl_source *dem, const tl_pyramid_options *options,
+                          tl_error *error);
 
 #endif

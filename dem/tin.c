@@ -39,8 +39,11 @@ typedef struct builder {
     /* Of the start's triangles, by class of their edges: the largest rise, and the largest product of it and the rise
      * along the edge. */
     double rise[TL_TIN_CLASSES], product[TL_TIN_CLASSES];
+    bool bends, shaped; /* whether the frame is bent; and whether triangles are judged by class, for that or for the
+                           rounding of the file's numbers */
+    tl_rounding rounding;
     dem_space *space;
-    dem_bend bend, rim_bend[4]; /* of the whole raster, and of the sides of its rim */
+    dem_bend bend, rim_bend[4]; /* of the whole raster, and of the sides of its rim; none in flat frames */
 } builder;
 
 /* ---- Reading ------------------------------------------------------------------------------------- */
@@ -74,6 +77,8 @@ static void inspect(builder *self)
     }
     self->magnitude = (double)fmaxf(-low, high);
     self->top = (double)high * self->dem->info.georef.height_unit;
+    self->rounding = self->options->rounding;
+    self->rounding.upright += self->rounding.of_range * ((double)high - (double)low);
     self->exact = !finer && self->magnitude < 0x1p21;
     self->voids = voids;
     for (int64_t x = 0; x < self->width; x++)
@@ -169,8 +174,10 @@ static tl_status start_inside(builder *self, tl_error *error)
     inner source = make_inner(self);
     tl_run quiet = self->options->run ? *self->options->run : (tl_run){0};
     quiet.progress = NULL;
-    tl_framework_options options = {
-        .max_error = self->options->max_error * self->share, .frame = self->options->frame, .run = &quiet};
+    tl_framework_options options = {.max_error = self->options->max_error * self->share,
+                                    .frame = self->options->frame,
+                                    .rounding = self->options->rounding,
+                                    .run = &quiet};
     tl_framework *framework = tl_framework_build(&source.source, &options, error);
     tl_mesh *mesh = NULL;
     tl_status status = framework ? TL_OK : error->status;
@@ -195,7 +202,11 @@ static double rim_sag(const void *context, int side, double length, double rise)
     const builder *self = context;
     const dem_bend *bend = &self->rim_bend[side];
     double unit = self->dem->info.georef.height_unit;
-    return dem_bend_error(bend, length * length, fmax(rise * unit, USUAL_SLOPE * bend->cell)) / unit;
+    double metres = fmax(rise * unit, USUAL_SLOPE * bend->cell), bound = self->options->max_error;
+    double sag = dem_bend_error(bend, length * length, metres) / unit;
+    double rounded = tl_rounds(&self->rounding) ? tl_rounding_error(&self->rounding, metres / unit) : 0;
+    /* two tiles round differently, but both leave this much */
+    return sag + (rounded > 0 ? fmax(rounded, bound / 64) : 0);
 }
 
 /* Rounded up to a 64th of itself: two tiles that share a side agree, though each looks from its own middle. */
@@ -264,27 +275,28 @@ static double across_edge(const builder *self, const dem_bend *bend, int class)
     double unit = self->dem->info.georef.height_unit;
     double slope = self->rise[class] > 0 ? self->rise[class] * unit / bend->cell : 0;
     double product = self->product[class] > 0 ? self->product[class] * unit / bend->cell * unit / bend->cell : 0;
-    return ldexp(1, class + 1) / 8 * (slope * bend->level + 2 * product * bend->upright);
+    double rounded = unit * tl_rounding_error(&self->rounding, self->rise[class]);
+    return ldexp(1, class + 1) / 8 * (slope * bend->level + 2 * product * bend->upright) + rounded;
 }
 
 /* Bound of what the bend adds to the error of a triangle: the sag, and the shift of a sample over the slope of its own
  * triangle and over that of a neighbour. Their common edge is no longer than either, so a neighbour counts with its own
- * class if that is smaller. */
-static double bent_by(const dem_bend *bend, double squared, double rise)
+ * class if that is smaller. And what rounding adds. */
+static double bent_by(const builder *self, const dem_bend *bend, double squared, double rise)
 {
-    double sag = dem_bend_error(bend, squared, 0);
-    return 2 * dem_bend_error(bend, squared, rise) - sag;
+    double unit = self->dem->info.georef.height_unit, sag = dem_bend_error(bend, squared, 0);
+    return 2 * dem_bend_error(bend, squared, rise) - sag + unit * tl_rounding_error(&self->rounding, rise / unit);
 }
 
 /* The largest rise that adds no more than `share`, to a part in 10^6; 0 where there is none. */
-static double allowed_rise(const dem_bend *bend, double squared, double share)
+static double allowed_rise(const builder *self, const dem_bend *bend, double squared, double share)
 {
     double low = 0, high = bend->cell; /* a slope of 1 */
-    while (high < 1e6 * bend->cell && bent_by(bend, squared, high) <= share)
+    while (high < 1e6 * bend->cell && bent_by(self, bend, squared, high) <= share)
         low = high, high *= 2;
     for (int k = 0; k < 20; k++) {
         double middle = 0.5 * (low + high);
-        if (bent_by(bend, squared, middle) <= share)
+        if (bent_by(self, bend, squared, middle) <= share)
             low = middle;
         else
             high = middle;
@@ -298,10 +310,10 @@ static void fill_limits(const builder *self, const dem_bend *bend, tl_tin_ground
 {
     double unit = self->dem->info.georef.height_unit, old = 0, new = 0, bound = self->options->max_error *unit;
     for (int k = 0; k < TL_TIN_CLASSES; k++) {
-        double squared = ldexp(1, k + 1), share = fmax(bound / 64, 3 * dem_bend_error(bend, squared, 0));
-        double rise = allowed_rise(bend, squared, share);
+        double squared = ldexp(1, k + 1), share = fmax(bound / 64, 3 * bent_by(self, bend, squared, 0));
+        double rise = allowed_rise(self, bend, squared, share);
         old = fmax(old, across_edge(self, bend, k));
-        new = fmax(new, bent_by(bend, squared, rise));
+        new = fmax(new, bent_by(self, bend, squared, rise));
         ground->limit[k] = new <= bound / 16 ? (bound - fmax(new, old)) / unit : -1;
         ground->rise[k] = rise / unit;
     }
@@ -431,9 +443,11 @@ static tl_status run_window(void *context, tl_parallel *loop, uint64_t item, uns
         return TL_OK;
     tl_window window = {x, y, right - x + 1, bottom - y + 1};
     tl_tin_ground ground = r->ground;
-    if (ground.bends) {
-        dem_bend bend = dem_space_bend(r->spaces[worker], (double)x, (double)y, (double)(right - x),
-                                       (double)(bottom - y), self->top);
+    if (ground.shaped) {
+        dem_bend bend = self->bend;
+        if (self->bends)
+            bend = dem_space_bend(r->spaces[worker], (double)x, (double)y, (double)(right - x), (double)(bottom - y),
+                                  self->top);
         fill_limits(self, &bend, &ground);
     }
     return tl_tin_patch_run(r->patches[worker], &ground, self->soup.vertices, self->settled, window,
@@ -463,8 +477,8 @@ static tl_status make_workers(step *r, unsigned workers, tl_error *error)
         if (!r->patches[k])
             return tl_fail_memory(error, "the mesh");
         r->spaces[k] =
-            r->ground.bends ? dem_space_create(&info->georef, info->width, info->height, info->name, error) : NULL;
-        if (r->ground.bends && !r->spaces[k])
+            r->self->bends ? dem_space_create(&info->georef, info->width, info->height, info->name, error) : NULL;
+        if (r->self->bends && !r->spaces[k])
             return error->status;
     }
     return r->patches && r->spaces ? TL_OK : tl_fail_memory(error, "the mesh");
@@ -491,7 +505,7 @@ static tl_status collapse_fits(const builder *self, unsigned workers, tl_error *
     return run_fits(self, 24.0 * (double)self->soup.triangle_count + 13 * vertices + patches, error);
 }
 
-static tl_status collapse_all(builder *self, bool bends, tl_error *error)
+static tl_status collapse_all(builder *self, tl_error *error)
 {
     const tl_run *run = self->options->run;
     step r = {.self = self, .columns = window_count(self->width), .rows = window_count(self->height)};
@@ -501,7 +515,7 @@ static tl_status collapse_all(builder *self, bool bends, tl_error *error)
                                .height = self->height,
                                .max_error = self->options->max_error,
                                .rounding = self->exact ? 0 : tl_plane_rounding(self->magnitude),
-                               .bends = bends};
+                               .shaped = self->shaped};
     unsigned workers = tl_parallel_workers(run, windows - 1);
     tl_status status = collapse_fits(self, workers, error);
     if (status != TL_OK)
@@ -583,6 +597,12 @@ static tl_status make_mesh(const builder *self, tl_mesh **out, tl_error *error)
 static tl_status look_at_frame(builder *self, tl_error *error)
 {
     const tl_source_info *info = &self->dem->info;
+    double cell = fmin(info->georef.cell_x, info->georef.cell_y);
+    self->bend = (dem_bend){0, 0, cell > 0 ? cell : 1};
+    for (int side = 0; side < 4; side++)
+        self->rim_bend[side] = self->bend;
+    if (!self->bends)
+        return TL_OK;
     self->space = dem_space_create(&info->georef, self->width, self->height, info->name, error);
     if (!self->space)
         return error->status;
@@ -611,18 +631,19 @@ static void free_soup(tl_tin_soup *soup)
 
 /* The mesh of the inner raster and the rim around it. What is cut beside voids moves by as much again. In a bent frame
  * the start is made finer until it leaves enough to that. */
-static tl_status start(builder *self, bool bends, tl_error *error)
+static tl_status start(builder *self, tl_error *error)
 {
-    tl_tin_rim rim = {self->heights,          self->width, self->height, self->options->max_error, WINDOW,
-                      bends ? rim_sag : NULL, self};
+    tl_tin_rim rim = {
+        self->heights, self->width, self->height, self->options->max_error, WINDOW, self->shaped ? rim_sag : NULL,
+        self};
     self->share = self->rim_voids ? 0.5 : self->options->kind == TL_MESH_TIN ? START : 1;
-    self->share *= bends ? 15.0 / 16 : 1;
+    self->share *= self->shaped ? 15.0 / 16 : 1;
     tl_status status;
     for (int tries = 0;; tries++, self->share /= 2) {
         status = start_inside(self, error);
         if (status == TL_OK)
             status = tl_tin_add_rim(&rim, &self->soup, error);
-        if (status != TL_OK || !bends || start_holds(self) || tries == 8)
+        if (status != TL_OK || !self->shaped || start_holds(self) || tries == 8)
             return status;
         free_soup(&self->soup);
     }
@@ -630,14 +651,15 @@ static tl_status start(builder *self, bool bends, tl_error *error)
 
 static tl_status build(builder *self, tl_error *error)
 {
-    bool bends = dem_frame_bends(&self->dem->info.georef, self->options->frame);
     tl_status status = read_dem(self, error);
-    if (status == TL_OK && bends)
+    self->bends = dem_frame_bends(&self->dem->info.georef, self->options->frame);
+    self->shaped = self->bends || tl_rounds(&self->rounding);
+    if (status == TL_OK && self->shaped)
         status = look_at_frame(self, error);
     if (status == TL_OK)
-        status = start(self, bends, error);
+        status = start(self, error);
     if (status == TL_OK && self->options->kind == TL_MESH_TIN && self->soup.triangle_count)
-        status = collapse_all(self, bends, error);
+        status = collapse_all(self, error);
     return status;
 }
 
@@ -645,7 +667,8 @@ static tl_status build(builder *self, tl_error *error)
 static tl_status simplify_plainly(const tl_source *dem, const tl_simplify_options *options, tl_mesh **out,
                                   uint64_t *uncovered, tl_error *error)
 {
-    tl_framework_options plain = {.max_error = options->max_error, .frame = options->frame, .run = options->run};
+    tl_framework_options plain = {
+        .max_error = options->max_error, .frame = options->frame, .rounding = options->rounding, .run = options->run};
     tl_framework *framework = tl_framework_build(dem, &plain, error);
     tl_status status = framework ? tl_framework_mesh(framework, out, error) : error->status;
     if (status == TL_OK && uncovered)

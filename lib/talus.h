@@ -415,13 +415,21 @@ TL_API tl_status tl_mesh_verify_in(const tl_mesh *mesh, const tl_source *source,
  * max_error from the surface. */
 typedef struct tl_framework tl_framework;
 
+/* How far the numbers of a mesh file may move a vertex: see tl_write_rounding. */
+typedef struct tl_rounding {
+    double along;    /* along the ground, in cells */
+    double upright;  /* upwards, in units of height, and */
+    double of_range; /* as much again for each unit in the range of heights */
+} tl_rounding;
+
 typedef struct tl_framework_options {
     double max_error; /* largest vertical distance allowed at any sample, in units of height; >= 0 */
     const tl_run *run;
-    /* The frame that the mesh will be written in, where the bound holds (before coordinates are rounded to the file's
-     * numbers). In ENU frames samples lie on the curved ellipsoid and triangles are flat, so that a wide one sags
-     * below level ground: by 2 m if it is 10 km wide. The other frames have flat lattices. */
+    /* The frame that the mesh will be written in, where the bound holds. In ENU frames samples lie on the curved
+     * ellipsoid and triangles are flat, so that a wide one sags below level ground: by 2 m if it is 10 km wide. The
+     * other frames have flat lattices. */
     tl_frame frame;
+    tl_rounding rounding; /* of the file that the mesh will be written to, which counts into the bound */
 } tl_framework_options;
 
 TL_API tl_framework *tl_framework_build(const tl_source *dem, const tl_framework_options *options, tl_error *error);
@@ -450,8 +458,9 @@ typedef enum tl_mesh_kind {
 } tl_mesh_kind;
 
 typedef struct tl_simplify_options {
-    double max_error; /* largest vertical distance allowed at any sample, in units of height; >= 0 */
-    tl_frame frame;   /* as in tl_framework_options */
+    double max_error;     /* largest vertical distance allowed at any sample, in units of height; >= 0 */
+    tl_frame frame;       /* as in tl_framework_options */
+    tl_rounding rounding; /* likewise */
     tl_mesh_kind kind;
     /* Choose the vertices on the raster's rim by its own samples alone, so that meshes of rasters that share their
      * outermost samples join without a crack. A TIN always does. (The rim may keep more where voids touch its second
@@ -480,7 +489,8 @@ typedef struct tl_pyramid_options {
      * of heights): strict all the same, and for bounds that are such numbers themselves, as 0.5, 1, 5, 20 or 100, as
      * good. */
     bool exact;
-    tl_frame frame; /* see tl_framework_options */
+    tl_frame frame;       /* see tl_framework_options */
+    tl_rounding rounding; /* likewise */
     const tl_run *run;
 } tl_pyramid_options;
 
@@ -598,6 +608,9 @@ TL_API tl_status tl_write_grid(const tl_source *source, const char *path, const 
  * its first vertex, which its header names: single precision is too coarse for them. */
 TL_API tl_status tl_write_mesh(const tl_mesh *mesh, const char *path, const tl_write_options *options, tl_error *error);
 
+/* A bound of the rounding in a mesh file of this name over a grid: none where its numbers hold what the frame asks for.
+ */
+TL_API tl_rounding tl_write_rounding(const tl_source_info *grid, const char *path, tl_frame frame);
 /* Reads back the file that tl_write_mesh made of `mesh` in `frame`, and compares it with every sample of the source as
  * tl_mesh_verify_in does, but with the numbers that the file has. Triangles that are upright or look down, walls and
  * floors, count for nothing. TL_ERROR_DATA where the file is not such a mesh. */

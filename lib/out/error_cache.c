@@ -195,7 +195,7 @@ tl_pyramid *tl_pyramid_load(const char *path, const tl_source *dem, const tl_pyr
     tl_pyramid *pyramid = tl_pyramid_allocate(&dem->info, options, error);
     if (!pyramid)
         return NULL;
-    tl_status status = tl_pyramid_look(pyramid, dem, options->run, error);
+    tl_status status = tl_pyramid_look(pyramid, dem, options, error);
     if (status == TL_OK)
         status = load(pyramid, path, label, error);
     if (status == TL_OK)
