@@ -344,7 +344,11 @@ static bool proj_string(GTIFDefn *definition, char *out, size_t size)
 {
     static const char *const precise[] = {"+k=",   "+k_0=",  "+x_0=",   "+y_0=",  "+lat_",
                                           "+lon_", "+lonc=", "+alpha=", "+gamma="};
+    /* units are left out below; a code that the database does not have would make PROJ print */
+    const short unit = definition->UOMLength;
+    definition->UOMLength = Linear_Meter;
     char *text = GTIFGetProj4Defn(definition), *rest = NULL;
+    definition->UOMLength = unit;
     size_t length = 0;
     if (!text)
         return false;
@@ -551,6 +555,24 @@ __attribute__((format(printf, 3, 4))) static void ignore_message(GTIF *gtif, int
     (void)message;
 }
 
+/* A copy of the directory whose unit of angles PROJ knows: about another one PROJ prints, and it counts as degrees. */
+static uint16_t *known_directory(PJ_CONTEXT *context, const dem_geokeys *keys)
+{
+    uint16_t *directory = malloc(keys->directory_count * sizeof *directory);
+    if (!directory)
+        return NULL;
+    memcpy(directory, keys->directory, keys->directory_count * sizeof *directory);
+    for (size_t i = 4; i + 4 <= keys->directory_count; i += 4) {
+        uint16_t *entry = directory + i;
+        char code[8];
+        snprintf(code, sizeof code, "%u", entry[3]);
+        if (entry[0] == GeogAngularUnitsGeoKey && entry[1] == 0 && entry[3] != KvUserDefined &&
+            !proj_uom_get_info_from_database(context, "EPSG", code, NULL, NULL, NULL))
+            entry[3] = Angular_Degree;
+    }
+    return directory;
+}
+
 /* libgeotiff over our checked copy of the keys, so that it neither meets unsound ones nor depends on how the process
  * has set up libtiff. */
 static PJ *crs_from_keys(PJ_CONTEXT *context, const dem_geokeys *keys)
@@ -558,9 +580,15 @@ static PJ *crs_from_keys(PJ_CONTEXT *context, const dem_geokeys *keys)
     PJ *crs = NULL;
     TIFFMethod methods;
     ST_TIFF *tags = ST_Create();
-    if (!tags)
+    uint16_t *directory = known_directory(context, keys);
+    if (!tags || !directory) {
+        if (tags)
+            ST_Destroy(tags);
+        free(directory);
         return NULL;
-    ST_SetKey(tags, TIFFTAG_GEOKEYDIRECTORY, (int)keys->directory_count, STT_SHORT, keys->directory);
+    }
+    ST_SetKey(tags, TIFFTAG_GEOKEYDIRECTORY, (int)keys->directory_count, STT_SHORT, directory); /* it copies */
+    free(directory);
     if (keys->double_count)
         ST_SetKey(tags, TIFFTAG_GEODOUBLEPARAMS, (int)keys->double_count, STT_DOUBLE, keys->doubles);
     if (keys->ascii_count)
