@@ -18,9 +18,9 @@ typedef struct tl_tin_ground {
     int64_t width, height;
     double max_error;
     double rounding; /* bound of what double arithmetic rounds on these heights; 0: it is exact */
-    /* In frames where the lattice is bent, by class: what the error may reach (below 0: no triangle), and the largest
-     * rise in a cell. */
-    bool bends;
+    /* Where the frame is bent or coordinates are rounded, by class: what the error may reach (below 0: no triangle),
+     * and the largest rise in a cell. */
+    bool shaped;
     double limit[TL_TIN_CLASSES], rise[TL_TIN_CLASSES];
 } tl_tin_ground;
 
@@ -61,8 +61,9 @@ typedef struct tl_tin_rim {
     int64_t width, height;
     double max_error;
     int64_t step; /* samples 1 + k step of each side stay, so that no triangle reaches over a line between windows */
-    /* In frames where the lattice is bent: by how much an edge of `length` cells may sag where the ground beside it
-     * rises by `rise` units of height in a cell, for each side (top, bottom, left, right). NULL: it is flat. */
+    /* Where the frame is bent or coordinates are rounded: by how much an edge of `length` cells may be off for it,
+     * where the ground beside it rises by `rise` units of height in a cell, for each side (top, bottom, left, right).
+     * NULL: by nothing. */
     double (*sag)(const void *context, int side, double length, double rise);
     const void *context;
 } tl_tin_rim;

@@ -373,7 +373,7 @@ static int gather(const tl_tin_patch *patch, const star *s)
         for (int k = 0; k + 1 < crossings; k += 2)
             count = add_row(patch, s, y, from[k], to[k + 1], count);
     }
-    if (patch->ground->bends)
+    if (patch->ground->shaped)
         count = add_rim(patch, s, count);
     while (count % LANES)
         count = add_row(patch, s, 0, 0, 0, count);
@@ -425,8 +425,8 @@ static inline double largest(double a, double b)
     return a > b ? a : b;
 }
 
-/* The error that triangle k of a fan may have in a bent frame; negative: the triangle may not be. */
-static double bent_limit(const tl_tin_ground *ground, const fan *f, int k)
+/* The error that triangle k of a fan may have by its class; negative: the triangle may not be. */
+static double class_limit(const tl_tin_ground *ground, const fan *f, int k)
 {
     double ax = (double)f->x[k], ay = (double)f->y[k], bx = (double)f->x[k + 1], by = (double)f->y[k + 1];
     double length2 = largest(ax * ax + ay * ay, bx * bx + by * by);
@@ -464,7 +464,7 @@ static bool make_fan(const tl_tin_patch *patch, const star *s, int apex, float r
         f->across[k] = (z[k] * f->y[k + 1] - z[k + 1] * f->y[k]) / area;
         f->down[k] = (z[k + 1] * f->x[k] - z[k] * f->x[k + 1]) / area;
         f->at[k] = s->z[apex] - f->across[k] * vx - f->down[k] * vy;
-        f->limit[k] = ground->bends ? bent_limit(ground, f, k) : ground->max_error;
+        f->limit[k] = ground->shaped ? class_limit(ground, f, k) : ground->max_error;
         if (!(f->limit[k] >= 0))
             return false;
         f->sure[k] = (float)f->limit[k] - float_margin(f, k, z[k], z[k + 1], area, reach, base);
