@@ -184,7 +184,7 @@ static void boxesBecomeWindows(void **state)
     assert_int_equal(tl_cut_of_box(&area.source->info, (double[]){0, 0, 1, 1}, &none, &error), TL_ERROR_ARGUMENT);
     assert_int_equal(tl_cut_of_box(&area.source->info, (double[]){500090, 0, 500000, 1e7}, &none, &error),
                      TL_ERROR_ARGUMENT);
-    assert_int_equal(tl_cut_of_box(&area.source->info, (double[]){500000, NAN, 500090, 1e7}, &none, &error),
+    assert_int_equal(tl_cut_of_box(&area.source->info, (double[]){500000, (double)NAN, 500090, 1e7}, &none, &error),
                      TL_ERROR_ARGUMENT);
     finish(&area);
 

@@ -335,6 +335,7 @@ static void filesTellThatHeightsAreEllipsoidal(void **state)
         }
         tl_source_destroy(made);
         plain_finish(&p);
+        tl_crs_release(crs);
     }
 }
 
