@@ -7,6 +7,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <unistd.h>
 
 #include <cmocka.h>
 
@@ -409,7 +410,7 @@ static float ground_height(const ground *of, int i, int j)
 {
     double u = 2 * i / (GROUND - 1.0) - 1, v = 2 * j / (GROUND - 1.0) - 1;
     double z = of->relief * (sin(5 * u + 2 * v) * cos(3 * v - u) + 0.05 * sin(90 * u) * sin(70 * v));
-    return (float)floor((z + (3 * i > 2 * j + 200 ? of->relief : 0)) / of->height_unit);
+    return (float)((z + (3 * i > 2 * j + 200 ? of->relief : 0)) / of->height_unit);
 }
 
 static void check_ground(const ground *of, tl_mesh_kind kind, double max_error)
@@ -426,9 +427,12 @@ static void check_ground(const ground *of, tl_mesh_kind kind, double max_error)
                               .height_unit = of->height_unit};
     assert_int_equal(dem_georef_measure(&info.georef, GROUND, GROUND, NULL), TL_OK);
     tl_source *source = tl_array_source_create(heights, &info, NULL);
-    made result = simplify_source(
-        source,
-        &(tl_simplify_options){.max_error = max_error, .frame = TL_FRAME_ENU, .kind = kind, .canonical_borders = true});
+    char path[64];
+    snprintf(path, sizeof path, "test_tin_%ld.ply", (long)getpid());
+    tl_simplify_options options = {
+        .max_error = max_error, .frame = TL_FRAME_ENU, .kind = kind, .canonical_borders = true};
+    options.rounding = tl_write_rounding(&info, path, TL_FRAME_ENU);
+    made result = simplify_source(source, &options);
     tl_mesh_report report = {0};
     assert_int_equal(tl_mesh_verify_in(result.mesh, source, TL_FRAME_ENU, NULL, &report, NULL), TL_OK);
     /* positions of 6.4e6 m round to 1e-9 m; a few of these and a division by the height's unit follow */
@@ -436,6 +440,13 @@ static void check_ground(const ground *of, tl_mesh_kind kind, double max_error)
         fail_msg("%s, %g: off by %.9g at %d, %d", of->crs, max_error, report.max_error, (int)report.worst_i,
                  (int)report.worst_j);
     assert_int_equal(report.uncovered, 0);
+    /* and of the file, with its rounded numbers */
+    tl_write_options writing = {.overwrite = true, .frame = TL_FRAME_ENU};
+    assert_int_equal(tl_write_mesh(result.mesh, path, &writing, NULL), TL_OK);
+    assert_int_equal(tl_mesh_verify_file(path, result.mesh, source, TL_FRAME_ENU, NULL, &report, NULL), TL_OK);
+    unlink(path);
+    if (!(report.max_error <= max_error))
+        fail_msg("%s, %g: the file is off by %.9g", of->crs, max_error, report.max_error);
     tl_mesh_destroy(result.mesh);
     tl_source_destroy(source);
     tl_crs_release(crs);
