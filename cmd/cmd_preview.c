@@ -58,7 +58,8 @@ static int draw(settings *set, const arguments *inputs)
     set->preview.run = &run;
     opened_input opened = command_open(&set->common, inputs, &run, &error);
     const tl_source *source = opened.source;
-    tl_source *beside = source && set->beside ? tl_open(set->beside, &error) : NULL;
+    const tl_dem_options second = {.memory = run.memory / 8, .run = &run};
+    tl_source *beside = source && set->beside ? tl_open_with(set->beside, &second, &error) : NULL;
     int status = EXIT_DONE;
     progress_stage(&bar, "drawing");
     if (!source || (set->beside && !beside) ||

@@ -86,8 +86,8 @@ typedef struct tl_crs tl_crs;
 
 /* Name of the CRS, as "NAD83 / UTM zone 11N"; never NULL. */
 TL_API const char *tl_crs_name(const tl_crs *crs);
-/* WKT2:2019 of the CRS on one line, a COMPOUNDCRS where it has a vertical part, a BOUNDCRS where a GeoTIFF without a code
- * gives a shift to WGS 84 (which is handed on, and never made); "" where it cannot be had. */
+/* WKT2:2019 of the CRS on one line, a COMPOUNDCRS where it has a vertical part, a BOUNDCRS where a GeoTIFF without a
+ * code gives a shift to WGS 84 (which is handed on, and never made); "" where it cannot be had. */
 TL_API const char *tl_crs_wkt(const tl_crs *crs);
 /* EPSG code of the CRS (of its horizontal part), 0 where it has none. */
 TL_API int tl_crs_epsg(const tl_crs *crs);
@@ -198,8 +198,8 @@ typedef struct tl_dem_options {
      * first that has a height gives it. */
     bool feather;
     /* Make every coarser level from full resolution. false: take the reduced copies that a file of area samples holds
-     * where they are smaller by exactly a power of two, of a mosaic where all its files hold them; how they were made is
-     * not known, so they may not be means. */
+     * where they are smaller by exactly a power of two, of a mosaic where all its files hold them; how they were made
+     * is not known, so they may not be means. */
     bool exact_levels;
     unsigned open_files; /* of a mosaic, at a time, beside those that are being read; 0: 64 */
     size_t memory;       /* bytes of decoded blocks kept for the next windows, beside those in use; 0: 64 MB */
