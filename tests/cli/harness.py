@@ -110,15 +110,14 @@ class Case:
             expect(result.status == status, f"{arguments}: exit status {result.status}, not {status}: {result.err}")
 
     def peak_memory(self, *arguments):
-        """Runs the program; its largest resident size in bytes."""
-        with open(self.path("stderr"), "wb") as err:
-            process = self.start(*arguments, stdout=subprocess.DEVNULL, stderr=err)
-            _, status, usage = os.wait4(process.pid, 0)
-            process.returncode = os.waitstatus_to_exitcode(status) if hasattr(os, "waitstatus_to_exitcode") else status
-        with open(self.path("stderr"), encoding="utf-8", errors="replace") as err:
-            self.judge(Result(process.returncode, "", err.read()), arguments, 0)
-        os.remove(self.path("stderr"))
-        return usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+        """Runs the program; its largest resident size in bytes. A process counts what the one that started it had in
+        memory, so a small one does."""
+        script = ("import resource, subprocess, sys; status = subprocess.call(sys.argv[1:], stdout=subprocess.DEVNULL);"
+                  "print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss); sys.exit(status)")
+        process = subprocess.run([sys.executable, "-I", "-S", "-c", script, self.program, *map(str, arguments)],
+                                 cwd=self.folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, timeout=TIMEOUT)
+        self.judge(Result(process.returncode, "", text(process.stderr)), arguments, 0)
+        return int(process.stdout) * (1 if sys.platform == "darwin" else 1024)
 
 
 def text(output):
