@@ -106,11 +106,12 @@ static void find_row(const finder *self, int64_t y, const uint64_t *none)
 {
     tl_framework *framework = self->framework;
     size_t words = framework->words, row = (size_t)y * words;
-    const uint64_t *here = self->valid ? self->valid + row : NULL;
-    const uint64_t *above = y > 0 ? here - words : none, *below = y + 1 < framework->info.height ? here + words : none;
+    const uint64_t *here = self->valid ? self->valid + row : none;
+    const uint64_t *above = self->valid && y > 0 ? here - words : none;
+    const uint64_t *below = self->valid && y + 1 < framework->info.height ? here + words : none;
     for (size_t w = 0; w < words; w++) {
         framework->points[row + w] |= framework->split[row + w];
-        if (!here)
+        if (!self->valid)
             continue;
         self->joined[row + w] = spanned(above, here, below, w, words);
         framework->points[row + w] &= self->joined[row + w];

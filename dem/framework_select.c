@@ -58,7 +58,7 @@ static tl_status mark_band(void *context, tl_parallel *loop, uint64_t item, unsi
         for (int64_t x = 0; x < self->width; x += 64) {
             int64_t count = tl_int64_min(64, self->width - x);
             size_t sample = (size_t)(y * self->width + x);
-            unsigned char bytes[64];
+            unsigned char bytes[64 + 8]; /* tl_pack_bits takes eight at a time */
             for (int64_t i = 0; i < count; i++)
                 bytes[i] = tl_pyramid_key(self->pyramid, sample + (size_t)i) > self->at.above;
             framework->split[(size_t)y * framework->words + (size_t)(x >> 6)] = tl_pack_bits(bytes, count);
