@@ -304,8 +304,15 @@ static double allowed_rise(const builder *self, const dem_bend *bend, double squ
     return low;
 }
 
+/* The share of the bound that the start leaves: what it keeps itself counts twice where it was cut. */
+static double left_over(const builder *self)
+{
+    return 1 - (self->rim_voids ? 2 : 1) * self->share;
+}
+
 /* What errors and rises may reach by class in a window that is bent like this. New triangles may rise as much as costs
- * no more than a 64th of the bound, or as three times their sag on level ground: steeper slivers are refused. */
+ * no more than a 64th of the bound, or as three times their sag on level ground: steeper slivers are refused.
+ * Triangles of the start may lie beside them, so they must not add more than is left there either. */
 static void fill_limits(const builder *self, const dem_bend *bend, tl_tin_ground *ground)
 {
     double unit = self->dem->info.georef.height_unit, old = 0, new = 0, bound = self->options->max_error *unit;
@@ -314,7 +321,7 @@ static void fill_limits(const builder *self, const dem_bend *bend, tl_tin_ground
         double rise = allowed_rise(self, bend, squared, share);
         old = fmax(old, across_edge(self, bend, k));
         new = fmax(new, bent_by(self, bend, squared, rise));
-        ground->limit[k] = new <= bound / 16 ? (bound - fmax(new, old)) / unit : -1;
+        ground->limit[k] = new <= bound *left_over(self) ? (bound - new - old) / unit : -1;
         ground->rise[k] = rise / unit;
     }
 }
@@ -611,15 +618,15 @@ static tl_status look_at_frame(builder *self, tl_error *error)
     return TL_OK;
 }
 
-/* Whether the triangles of the rim, which may be steep, leave what lies beside them within the bound in a bent frame:
- * what the start keeps, twice that where it was cut, and what one of them or (a 16th) a later one adds. */
+/* Whether the triangles of the rim, which may be steep, add no more to the error of what lies beside them than is left.
+ */
 static bool start_holds(builder *self)
 {
     double worst = 0, bound = self->options->max_error * self->dem->info.georef.height_unit;
     find_rises(self);
     for (int k = 0; k < TL_TIN_CLASSES; k++)
         worst = fmax(worst, across_edge(self, &self->bend, k));
-    return fmax(worst, bound / 16) <= bound * (1 - (self->rim_voids ? 2 : 1) * self->share);
+    return worst <= bound * left_over(self);
 }
 
 static void free_soup(tl_tin_soup *soup)

@@ -469,6 +469,72 @@ static void keepsBoundInEnuFrames(void **state)
     }
 }
 
+typedef struct moved {
+    double x, y, z;
+} moved;
+
+static double turn(const moved *a, const moved *b, double x, double y)
+{
+    return (b->x - a->x) * (y - a->y) - (b->y - a->y) * (x - a->x);
+}
+
+/* The largest error of a sample of the grid under the triangle of moved corners that covers it. */
+static double error_of_moved(const grid *of, const moved v[3])
+{
+    double worst = 0, whole = turn(&v[0], &v[1], v[2].x, v[2].y);
+    int x0 = (int)fmax(ceil(fmin(fmin(v[0].x, v[1].x), v[2].x)), 0),
+        y0 = (int)fmax(ceil(fmin(fmin(v[0].y, v[1].y), v[2].y)), 0);
+    double x1 = fmin(fmax(fmax(v[0].x, v[1].x), v[2].x), of->width - 1);
+    double y1 = fmin(fmax(fmax(v[0].y, v[1].y), v[2].y), of->height - 1);
+    for (int y = y0; y <= y1; y++)
+        for (int x = x0; x <= x1; x++) {
+            double a = turn(&v[1], &v[2], x, y) / whole, b = turn(&v[2], &v[0], x, y) / whole;
+            if (a >= 0 && b >= 0 && a + b <= 1)
+                worst = fmax(worst,
+                             fabs(a * v[0].z + b * v[1].z + (1 - a - b) * v[2].z - (double)of->z[y * of->width + x]));
+        }
+    return worst;
+}
+
+/* Whatever a file's numbers do to the vertices within the rounding that is allowed for. */
+static void keepsBoundWhereVerticesAreMoved(void **state)
+{
+    (void)state;
+    const tl_rounding rounding = {.along = 0.02, .upright = 0.1, .of_range = 0.0005};
+    for (unsigned seed = 0; seed < 12; seed++) {
+        random_state = seed;
+        grid of = make_grid(60, 60, TERRAIN_HILLS, VOIDS_NONE);
+        float low = of.z[0], high = of.z[0];
+        for (int k = 0; k < 3600; k++)
+            low = fminf(low, of.z[k]), high = fmaxf(high, of.z[k]);
+        tl_source *source = open_grid(&of);
+        made result = simplify_source(source, &(tl_simplify_options){.max_error = 8,
+                                                                     .kind = seed % 3 ? TL_MESH_TIN : TL_MESH_QUADTREE,
+                                                                     .canonical_borders = true,
+                                                                     .rounding = rounding});
+        const tl_mesh *mesh = result.mesh;
+        assert_true(mesh->triangle_count < 59 * 59);
+        moved *at = malloc(mesh->vertex_count * sizeof *at);
+        for (size_t k = 0; k < mesh->vertex_count; k++) { /* to the rim of what is allowed */
+            double angle = random_below(1000), up = rounding.upright + rounding.of_range * (double)(high - low);
+            at[k] = (moved){mesh->vertices[k].i + rounding.along * cos(angle),
+                            mesh->vertices[k].j + rounding.along * sin(angle),
+                            (double)mesh->vertices[k].z + (random_below(2) ? up : -up)};
+        }
+        double worst = 0;
+        for (size_t t = 0; t < mesh->triangle_count; t++) {
+            const uint32_t *k = mesh->indices + 3 * t;
+            worst = fmax(worst, error_of_moved(&of, (moved[3]){at[k[0]], at[k[1]], at[k[2]]}));
+        }
+        if (!(worst <= 8))
+            fail_msg("seed %u: off by %.9g", seed, worst);
+        free(at);
+        tl_mesh_destroy(result.mesh);
+        tl_source_destroy(source);
+        free(of.z);
+    }
+}
+
 /* ---- Refusals ------------------------------------------------------------------------------------------ */
 
 static void refusesBoundsThatAreNone(void **state)
@@ -527,12 +593,19 @@ static void refusesWhatDoesNotFitIntoTheMemoryGiven(void **state)
 int main(void)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(keepsBoundOnRandomDems),       cmocka_unit_test(keepsBoundAtSpikesAndVoidsOnTheRim),
-        cmocka_unit_test(keepsBoundOverSeveralWindows), cmocka_unit_test(isTheSameForAnyThreads),
-        cmocka_unit_test(planeTakesNoMoreThanItsRim),   cmocka_unit_test(tinIsSmallerThanQuadtree),
-        cmocka_unit_test(tilesJoinWithoutACrack),       cmocka_unit_test(wideTilesJoinWithoutACrack),
-        cmocka_unit_test(keepsBoundInEnuFrames),        cmocka_unit_test(refusesBoundsThatAreNone),
-        cmocka_unit_test(stopsWhenCancelled),           cmocka_unit_test(refusesWhatDoesNotFitIntoTheMemoryGiven),
+        cmocka_unit_test(keepsBoundOnRandomDems),
+        cmocka_unit_test(keepsBoundAtSpikesAndVoidsOnTheRim),
+        cmocka_unit_test(keepsBoundOverSeveralWindows),
+        cmocka_unit_test(isTheSameForAnyThreads),
+        cmocka_unit_test(planeTakesNoMoreThanItsRim),
+        cmocka_unit_test(tinIsSmallerThanQuadtree),
+        cmocka_unit_test(tilesJoinWithoutACrack),
+        cmocka_unit_test(wideTilesJoinWithoutACrack),
+        cmocka_unit_test(keepsBoundInEnuFrames),
+        cmocka_unit_test(keepsBoundWhereVerticesAreMoved),
+        cmocka_unit_test(refusesBoundsThatAreNone),
+        cmocka_unit_test(stopsWhenCancelled),
+        cmocka_unit_test(refusesWhatDoesNotFitIntoTheMemoryGiven),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }
