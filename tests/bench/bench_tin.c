@@ -1,5 +1,6 @@
 /* Nanoseconds per sample of the irregular mesh at several bounds, on one core and on two, beside the quadtree that it
  * is made from and a copy of the same samples; and what it saves. The terrain is fractional noise in whole numbers. */
+#include "lib/base/georef.h"
 #include "lib/talus.h"
 #include "tests/bench/bench.h"
 
@@ -47,7 +48,7 @@ int main(void)
     tl_source_destroy(noise);
     for (int k = 0; k < SIZE * SIZE; k++)
         heights[k] = (float)(int)heights[k];
-    tl_source_info info = {.width = SIZE, .height = SIZE, .name = "noise"};
+    tl_source_info info = {.width = SIZE, .height = SIZE, .georef = tl_georef_none(), .name = "noise"};
     work self = {.source = tl_array_source_create(heights, &info, NULL)};
     bench_print_machine();
     printf("copy %.2f ns/sample\n", 1e9 * bench_copy(sizeof heights, RUNS) / ((double)SIZE * SIZE));
