@@ -53,7 +53,7 @@ static void run(analysis *a, int first, float amplitude, uint64_t seed)
     a->step.seed = seed;
     a->step.amplitude = amplitude;
     for (int l = first; l < a->levels; l++) {
-        fbm_refine_by(&a->kernel, &a->step, a->heights[l], a->window[l], a->heights[l + 1], a->window[l + 1],
+        fbm_refine_by(&a->kernel, &a->step, a->heights[l], NULL, a->window[l], a->heights[l + 1], a->window[l + 1],
                       a->scratch);
         a->step.amplitude = 0;
     }

@@ -217,6 +217,18 @@ static void mean4(const float *restrict a, const float *restrict b, const float 
             out[x] = 0.25F * ((a[x] + a[x + 1]) + (b[x] + b[x + 1]));
 }
 
+static void scale2(const float *restrict a, const float *restrict b, float *restrict g, size_t count)
+{
+    for (size_t x = 0; x < count; x++)
+        g[x] *= 0.5F * (a[x] + b[x]);
+}
+
+static void scale4(const float *restrict a, const float *restrict b, float *restrict g, size_t count)
+{
+    for (size_t x = 0; x < count; x++)
+        g[x] *= 0.25F * ((a[x] + a[x + 1]) + (b[x] + b[x + 1]));
+}
+
 static void interleave(const float *restrict even, const float *restrict odd, float *restrict out, size_t count)
 {
     for (size_t x = 0; x < count; x++) {
@@ -233,5 +245,7 @@ const fbm_kernel JOIN(fbm_kernel_, FBM_KERNEL) = {
     .edges = edges,
     .mean2 = mean2,
     .mean4 = mean4,
+    .scale2 = scale2,
+    .scale4 = scale4,
     .interleave = interleave,
 };

@@ -38,6 +38,9 @@ typedef struct fbm_kernel {
     void (*mean2)(const float *a, const float *b, const float *g, float t, float *out, size_t count);
     /* the same of the 4 corners (a[x], a[x + 1], b[x], b[x + 1]) */
     void (*mean4)(const float *a, const float *b, const float *g, float t, float *out, size_t count);
+    /* g[x] *= (a[x] + b[x]) / 2, and the same of the 4 corners */
+    void (*scale2)(const float *a, const float *b, float *g, size_t count);
+    void (*scale4)(const float *a, const float *b, float *g, size_t count);
     /* out[2x] = even[x], out[2x + 1] = odd[x] */
     void (*interleave)(const float *even, const float *odd, float *out, size_t count);
 } fbm_kernel;
@@ -45,10 +48,10 @@ typedef struct fbm_kernel {
 /* The kernels that were built and that this processor runs, best first, ended by NULL; the last is the portable one. */
 const fbm_kernel *const *fbm_kernels(void);
 
-/* fbm_refine, fbm_centres and fbm_noise_row with a kernel of the caller's choice. */
-void fbm_refine_by(const fbm_kernel *kernel, const fbm_step *step, const float *in, fbm_window in_window, float *out,
-                   fbm_window out_window, float *scratch);
-void fbm_centres_by(const fbm_kernel *kernel, const fbm_step *step, const float *in, fbm_window in_window, float *out,
-                    fbm_window cells, float *scratch);
+/* fbm_refine_mapped and fbm_centres_mapped with a kernel of the caller's choice; `map` may be NULL. */
+void fbm_refine_by(const fbm_kernel *kernel, const fbm_step *step, const float *in, const float *map,
+                   fbm_window in_window, float *out, fbm_window out_window, float *scratch);
+void fbm_centres_by(const fbm_kernel *kernel, const fbm_step *step, const float *in, const float *map,
+                    fbm_window in_window, float *out, fbm_window cells, float *scratch);
 
 #endif

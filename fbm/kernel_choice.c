@@ -1,14 +1,14 @@
 /* Which kernels this processor runs, found once. (AVX-512 was measured: no faster than AVX2 for a level.) */
 #include "fbm/kernel.h"
-#include "fbm/terrain_kernel.h"
+#include "fbm/relief_kernel.h"
 
 #include <stdatomic.h>
 
 extern const fbm_kernel fbm_kernel_plain;
-extern const fbm_terrain_kernel fbm_terrain_kernel_plain;
+extern const fbm_relief_kernel fbm_relief_kernel_plain;
 #ifdef FBM_HAVE_AVX2
 extern const fbm_kernel fbm_kernel_avx2;
-extern const fbm_terrain_kernel fbm_terrain_kernel_avx2;
+extern const fbm_relief_kernel fbm_relief_kernel_avx2;
 #endif
 
 static const fbm_kernel *const all[] = {
@@ -19,11 +19,11 @@ static const fbm_kernel *const all[] = {
     NULL,
 };
 
-static const fbm_terrain_kernel *const all_terrain[] = {
+static const fbm_relief_kernel *const all_terrain[] = {
 #ifdef FBM_HAVE_AVX2
-    &fbm_terrain_kernel_avx2,
+    &fbm_relief_kernel_avx2,
 #endif
-    &fbm_terrain_kernel_plain,
+    &fbm_relief_kernel_plain,
     NULL,
 };
 
@@ -55,7 +55,7 @@ const fbm_kernel *const *fbm_kernels(void)
     return all + best_index();
 }
 
-const fbm_terrain_kernel *const *fbm_terrain_kernels(void)
+const fbm_relief_kernel *const *fbm_relief_kernels(void)
 {
     return all_terrain + best_index();
 }

@@ -78,7 +78,7 @@ size_t fbm_refine_scratch(size_t width)
 typedef struct walk {
     const fbm_kernel *kernel;
     const fbm_step *step;
-    const float *in;
+    const float *in, *map;
     fbm_window from;
     int64_t column; /* of the first cell of the strip */
     size_t count;   /* cells of the strip */
@@ -98,12 +98,17 @@ static const float *input(const walk *w, int64_t column, int64_t row)
     return w->in + (size_t)(row - w->from.j) * w->from.stride + (size_t)(column - w->from.i);
 }
 
+static const float *factors(const walk *w, int64_t column, int64_t row)
+{
+    return w->map + (size_t)(row - w->from.j) * w->from.stride + (size_t)(column - w->from.i);
+}
+
 static float *ring_row(float *const ring[RING], int64_t row)
 {
     return ring[row & (RING - 1)];
 }
 
-static void noise_row(const walk *w, fbm_noise_kind kind, int64_t row, int64_t first, size_t count, float *out)
+static void unit_noise(const walk *w, fbm_noise_kind kind, int64_t row, int64_t first, size_t count, float *out)
 {
     const fbm_step *step = w->step;
     int64_t period = step->period;
@@ -118,17 +123,38 @@ static void noise_row(const walk *w, fbm_noise_kind kind, int64_t row, int64_t f
     }
 }
 
+/* Multiplies noise by the map at its vertices' means. */
+static void apply_map(const walk *w, fbm_noise_kind kind, int64_t row, int64_t first, size_t count, float *noise)
+{
+    const float *at = factors(w, first, row);
+    if (kind == FBM_NOISE_ROW_EDGES)
+        w->kernel->scale2(at, at + 1, noise, count);
+    else if (kind == FBM_NOISE_COLUMN_EDGES)
+        w->kernel->scale2(at, at + w->from.stride, noise, count);
+    else
+        w->kernel->scale4(at, at + w->from.stride, noise, count);
+}
+
+static void noise_row(const walk *w, fbm_noise_kind kind, int64_t row, int64_t first, size_t count, float *out)
+{
+    unit_noise(w, kind, row, first, count, out);
+    if (w->map)
+        apply_map(w, kind, row, first, count, out);
+}
+
 /* The noise of `count` points, rounded up to whole vectors, for which the rows have room. */
 static void make_noise(const walk *w, float *const ring[RING], fbm_noise_kind kind, int64_t row, int64_t first,
                        size_t count)
 {
-    noise_row(w, kind, row, first, (count + 7) / 8 * 8, ring_row(ring, row));
+    unit_noise(w, kind, row, first, (count + 7) / 8 * 8, ring_row(ring, row));
+    if (w->map)
+        apply_map(w, kind, row, first, count, ring_row(ring, row));
 }
 
-static void start(walk *w, const fbm_kernel *kernel, const fbm_step *step, const float *in, fbm_window from,
-                  float *scratch, size_t cells)
+static void start(walk *w, const fbm_kernel *kernel, const fbm_step *step, const float *in, const float *map,
+                  fbm_window from, float *scratch, size_t cells)
 {
-    *w = (walk){.kernel = kernel, .step = step, .in = in, .from = from, .noisy = step->amplitude != 0};
+    *w = (walk){.kernel = kernel, .step = step, .in = in, .map = map, .from = from, .noisy = step->amplitude != 0};
     for (int k = 0; k < 3; k++) {
         w->centre_taps[k] = step->amplitude * step->weights.centre_taps[k];
         w->edge_taps[k] = step->amplitude * step->weights.edge_taps[k];
@@ -339,8 +365,8 @@ static void require(bool met)
     (void)met;
 }
 
-void fbm_refine_by(const fbm_kernel *kernel, const fbm_step *step, const float *in, fbm_window in_window, float *out,
-                   fbm_window out_window, float *scratch)
+void fbm_refine_by(const fbm_kernel *kernel, const fbm_step *step, const float *in, const float *map,
+                   fbm_window in_window, float *out, fbm_window out_window, float *scratch)
 {
     if (!out_window.width || !out_window.height)
         return;
@@ -348,7 +374,7 @@ void fbm_refine_by(const fbm_kernel *kernel, const fbm_step *step, const float *
     int64_t first = half(out_window.i), last = half(out_window.i + (int64_t)out_window.width - 1);
     size_t cells = (size_t)(last - first + 1), strip = strip_size(cells);
     walk w;
-    start(&w, kernel, step, in, in_window, scratch, cells);
+    start(&w, kernel, step, in, map, in_window, scratch, cells);
     for (size_t x = 0; x < cells; x += strip) {
         w.column = first + (int64_t)x;
         w.count = cells - x < strip ? cells - x : strip;
@@ -356,14 +382,14 @@ void fbm_refine_by(const fbm_kernel *kernel, const fbm_step *step, const float *
     }
 }
 
-void fbm_centres_by(const fbm_kernel *kernel, const fbm_step *step, const float *in, fbm_window in_window, float *out,
-                    fbm_window cells, float *scratch)
+void fbm_centres_by(const fbm_kernel *kernel, const fbm_step *step, const float *in, const float *map,
+                    fbm_window in_window, float *out, fbm_window cells, float *scratch)
 {
     if (!cells.width || !cells.height)
         return;
     require(contains(in_window, fbm_centres_support(step->scheme, cells)) && cells.stride >= cells.width);
     walk w;
-    start(&w, kernel, step, in, in_window, scratch, cells.width);
+    start(&w, kernel, step, in, map, in_window, scratch, cells.width);
     size_t strip = strip_size(cells.width);
     for (size_t x = 0; x < cells.width; x += strip) {
         size_t count = cells.width - x < strip ? cells.width - x : strip;
@@ -384,14 +410,26 @@ void fbm_centres_by(const fbm_kernel *kernel, const fbm_step *step, const float 
     }
 }
 
+void fbm_refine_mapped(const fbm_step *step, const float *in, const float *map, fbm_window in_window, float *out,
+                       fbm_window out_window, float *scratch)
+{
+    fbm_refine_by(fbm_kernels()[0], step, in, map, in_window, out, out_window, scratch);
+}
+
 void fbm_refine(const fbm_step *step, const float *in, fbm_window in_window, float *out, fbm_window out_window,
                 float *scratch)
 {
-    fbm_refine_by(fbm_kernels()[0], step, in, in_window, out, out_window, scratch);
+    fbm_refine_mapped(step, in, NULL, in_window, out, out_window, scratch);
+}
+
+void fbm_centres_mapped(const fbm_step *step, const float *in, const float *map, fbm_window in_window, float *out,
+                        fbm_window cells, float *scratch)
+{
+    fbm_centres_by(fbm_kernels()[0], step, in, map, in_window, out, cells, scratch);
 }
 
 void fbm_centres(const fbm_step *step, const float *in, fbm_window in_window, float *out, fbm_window cells,
                  float *scratch)
 {
-    fbm_centres_by(fbm_kernels()[0], step, in, in_window, out, cells, scratch);
+    fbm_centres_mapped(step, in, NULL, in_window, out, cells, scratch);
 }

@@ -70,10 +70,19 @@ size_t fbm_refine_scratch(size_t width);
 void fbm_refine(const fbm_step *step, const float *in, fbm_window in_window, float *out, fbm_window out_window,
                 float *scratch);
 
+/* The same with a strength that varies: all noise is multiplied by `map`, factors at the input's vertices (of the
+ * window `in_window`, with its stride) that are interpolated to where the noise is: the mean of an edge's two ends or
+ * of a cell's four corners. Refined by means from level to level (scheme "square", amplitude 0), a map is bilinear
+ * between the vertices where it began. NULL: 1 everywhere. */
+void fbm_refine_mapped(const fbm_step *step, const float *in, const float *map, fbm_window in_window, float *out,
+                       fbm_window out_window, float *scratch);
+
 /* Only the first half step: the centres of the cells `cells`, where cell (i, j) has its centre at (i + 1/2, j + 1/2) of
  * level step->level. Equal, bit for bit, to the samples (2i + 1, 2j + 1) that fbm_refine makes. `scratch` as for an
  * output twice as wide. */
 void fbm_centres(const fbm_step *step, const float *in, fbm_window in_window, float *out, fbm_window cells,
                  float *scratch);
+void fbm_centres_mapped(const fbm_step *step, const float *in, const float *map, fbm_window in_window, float *out,
+                        fbm_window cells, float *scratch);
 
 #endif

@@ -51,7 +51,16 @@ static fbm_step make_step(const fbm_scheme *scheme, double hurst, float amplitud
 static float *refine(const fbm_kernel *kernel, const fbm_step *step, const float *in, fbm_window from, fbm_window to)
 {
     float *out = allocate(samples(to)), *scratch = allocate(fbm_refine_scratch(to.width));
-    fbm_refine_by(kernel, step, in, from, out, to, scratch);
+    fbm_refine_by(kernel, step, in, NULL, from, out, to, scratch);
+    free(scratch);
+    return out;
+}
+
+static float *refine_mapped(const fbm_kernel *kernel, const fbm_step *step, const float *in, const float *map,
+                            fbm_window from, fbm_window to)
+{
+    float *out = allocate(samples(to)), *scratch = allocate(fbm_refine_scratch(to.width));
+    fbm_refine_by(kernel, step, in, map, from, out, to, scratch);
     free(scratch);
     return out;
 }
@@ -405,16 +414,55 @@ static void supportIsAHaloThatConverges(void **state)
     assert_int_equal(window.height, 9);
 }
 
+/* A factor of 2 everywhere is the double amplitude, bit for bit; a varying map gives each sample what its own vertices
+ * say, whatever the window; on every instruction set. */
+static void mapsScaleTheNoise(void **state)
+{
+    (void)state;
+    for (const fbm_scheme *scheme = fbm_schemes; scheme->name; scheme++) {
+        fbm_window to = {-5, 3, 61, 40, 61}, from = fbm_refine_support(scheme, to);
+        fbm_step step = make_step(scheme, .6, 3), twice = make_step(scheme, .6, 6);
+        float *in = make_heights(from), *map = allocate(samples(from));
+        for (size_t k = 0; k < samples(from); k++)
+            map[k] = 2;
+        float *mapped = refine_mapped(best(), &step, in, map, from, to), *plain = refine(best(), &twice, in, from, to);
+        assert_memory_equal(mapped, plain, samples(to) * sizeof *plain);
+        free(mapped);
+        free(plain);
+        for (size_t k = 0; k < samples(from); k++)
+            map[k] = (float)arbitrary(1000) / 100;
+        float *whole = refine_mapped(best(), &step, in, map, from, to);
+        for (const fbm_kernel *const *kernel = fbm_kernels(); *kernel; kernel++) {
+            fbm_window part = {to.i + 7, to.j + 5, 30, 22, 30};
+            float *some = refine_mapped(*kernel, &step, in, map, from, part);
+            for (size_t r = 0; r < part.height; r++)
+                assert_memory_equal(some + r * 30, whole + (r + 5) * 61 + 7, 30 * sizeof *some);
+            free(some);
+        }
+        free(whole);
+        free(in);
+        free(map);
+    }
+}
+
 int main(void)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(windowsEqualTheWholeBitForBit),     cmocka_unit_test(everyKernelRefinesToTheSameBits),
-        cmocka_unit_test(scratchSufficesForEveryWidth),      cmocka_unit_test(centresEqualTheOddSamples),
-        cmocka_unit_test(verticesKeepTheirHeights),          cmocka_unit_test(gapsBetweenRowsAreLeftAlone),
-        cmocka_unit_test(smoothRefinementKeepsPlanes),       cmocka_unit_test(noiseIsProportionalToTheAmplitude),
-        cmocka_unit_test(otherSeedsAndLevelsGiveOtherNoise), cmocka_unit_test(noiseIsKeyedByLatticeCoordinates),
-        cmocka_unit_test(noiseHasTheStatedVariance),         cmocka_unit_test(squareTakesMeansOfCornersAndEnds),
-        cmocka_unit_test(voidsSpreadOverTheStencilOnly),     cmocka_unit_test(supportIsAHaloThatConverges),
+        cmocka_unit_test(mapsScaleTheNoise),
+        cmocka_unit_test(windowsEqualTheWholeBitForBit),
+        cmocka_unit_test(everyKernelRefinesToTheSameBits),
+        cmocka_unit_test(scratchSufficesForEveryWidth),
+        cmocka_unit_test(centresEqualTheOddSamples),
+        cmocka_unit_test(verticesKeepTheirHeights),
+        cmocka_unit_test(gapsBetweenRowsAreLeftAlone),
+        cmocka_unit_test(smoothRefinementKeepsPlanes),
+        cmocka_unit_test(noiseIsProportionalToTheAmplitude),
+        cmocka_unit_test(otherSeedsAndLevelsGiveOtherNoise),
+        cmocka_unit_test(noiseIsKeyedByLatticeCoordinates),
+        cmocka_unit_test(noiseHasTheStatedVariance),
+        cmocka_unit_test(squareTakesMeansOfCornersAndEnds),
+        cmocka_unit_test(voidsSpreadOverTheStencilOnly),
+        cmocka_unit_test(supportIsAHaloThatConverges),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }

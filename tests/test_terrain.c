@@ -1,5 +1,5 @@
 /* Terrain's detail: means, windows, instruction sets, calibration. */
-#include "fbm/terrain_kernel.h"
+#include "fbm/relief_kernel.h"
 #include "lib/base/georef.h"
 #include "lib/base/size.h"
 #include "lib/scene/roughness.h"
@@ -31,18 +31,18 @@ static float *allocate(size_t count)
     return out;
 }
 
-static fbm_terrain_step make_step(void)
+static fbm_relief_step make_step(void)
 {
-    return (fbm_terrain_step){.children_x = 4,
-                              .children_y = 6,
-                              .gains = {2, 3, 1},
-                              .steer = 1.3f,
-                              .steer_slope2 = .2f,
-                              .level = 5,
-                              .level_slope = .4f,
-                              .limit = .3f,
-                              .seed = 5,
-                              .octave = 2};
+    return (fbm_relief_step){.children_x = 4,
+                             .children_y = 6,
+                             .gains = {2, 3, 1},
+                             .steer = 1.3f,
+                             .steer_slope2 = .2f,
+                             .level = 5,
+                             .level_slope = .4f,
+                             .limit = .3f,
+                             .seed = 5,
+                             .octave = 2};
 }
 
 typedef struct cells {
@@ -66,12 +66,12 @@ static void free_cells(cells c)
     free(c.energy);
 }
 
-static float *refine(size_t kernel, const fbm_terrain_step *step, cells in, fbm_window children, float *energy)
+static float *refine(size_t kernel, const fbm_relief_step *step, cells in, fbm_window children, float *energy)
 {
     float *out = allocate(children.stride * children.height);
-    float *scratch = allocate(fbm_terrain_scratch(children.width, children.height));
-    fbm_terrain_kernels()[kernel]->refine(fbm_kernels()[kernel], step, in.heights, in.energy, in.window, out, energy,
-                                          children, scratch);
+    float *scratch = allocate(fbm_relief_scratch(children.width, children.height));
+    fbm_relief_kernels()[kernel]->refine(fbm_kernels()[kernel], step, in.heights, in.energy, in.window, out, energy,
+                                         children, scratch);
     free(scratch);
     return out;
 }
@@ -80,9 +80,9 @@ static float *refine(size_t kernel, const fbm_terrain_step *step, cells in, fbm_
 static void childrenHaveTheMeanOfTheirCell(void **state)
 {
     (void)state;
-    const fbm_terrain_step step = make_step();
+    const fbm_relief_step step = make_step();
     fbm_window children = {-6, 4, 48, 36, 48};
-    cells in = make_cells(fbm_terrain_support(children));
+    cells in = make_cells(fbm_relief_support(children));
     float *out = refine(0, &step, in, children, NULL);
     double moved = 0;
     for (size_t y = 0; y < 36; y += 2)
@@ -90,7 +90,7 @@ static void childrenHaveTheMeanOfTheirCell(void **state)
             const float *z = out + y * 48 + x;
             double mean = ((double)z[0] + (double)z[1] + (double)z[48] + (double)z[49]) / 4;
             double cell =
-                (double)in.heights[(y / 2 + FBM_TERRAIN_MARGIN) * in.window.stride + x / 2 + FBM_TERRAIN_MARGIN];
+                (double)in.heights[(y / 2 + FBM_RELIEF_MARGIN) * in.window.stride + x / 2 + FBM_RELIEF_MARGIN];
             assert_near(mean, cell, 8 * 512 * 0x1p-24);
             moved += fabs((double)z[0] - cell);
         }
@@ -102,9 +102,9 @@ static void childrenHaveTheMeanOfTheirCell(void **state)
 static void windowsOfChildrenEqualTheWhole(void **state)
 {
     (void)state;
-    const fbm_terrain_step step = make_step();
+    const fbm_relief_step step = make_step();
     fbm_window whole = {-9, -21, 61, 45, 61};
-    cells in = make_cells(fbm_terrain_support(whole));
+    cells in = make_cells(fbm_relief_support(whole));
     float *energy = allocate(whole.stride * whole.height), *all = refine(0, &step, in, whole, energy);
     for (int round = 0; round < 60; round++) {
         uint32_t x = arbitrary(61), y = arbitrary(45);
@@ -126,11 +126,11 @@ static void windowsOfChildrenEqualTheWhole(void **state)
 static void instructionSetsGiveTheSameBits(void **state)
 {
     (void)state;
-    const fbm_terrain_step step = make_step();
+    const fbm_relief_step step = make_step();
     fbm_window children = {3, 5, 131, 67, 131};
-    cells in = make_cells(fbm_terrain_support(children));
+    cells in = make_cells(fbm_relief_support(children));
     float *best = refine(0, &step, in, children, NULL);
-    for (size_t k = 1; fbm_terrain_kernels()[k]; k++) {
+    for (size_t k = 1; fbm_relief_kernels()[k]; k++) {
         float *other = refine(k, &step, in, children, NULL);
         assert_memory_equal(best, other, 131 * 67 * sizeof *best);
         free(other);
@@ -142,9 +142,9 @@ static void instructionSetsGiveTheSameBits(void **state)
     out.stride = out.width;
     float *a = allocate(out.width * out.height), *b = allocate(out.width * out.height);
     float *scratch = allocate(fbm_energy_scratch(out.width, out.height));
-    fbm_terrain_kernels()[0]->energy(in.heights, in.window, a, out, scratch);
-    for (size_t k = 1; fbm_terrain_kernels()[k]; k++) {
-        fbm_terrain_kernels()[k]->energy(in.heights, in.window, b, out, scratch);
+    fbm_relief_kernels()[0]->energy(in.heights, in.window, a, out, scratch);
+    for (size_t k = 1; fbm_relief_kernels()[k]; k++) {
+        fbm_relief_kernels()[k]->energy(in.heights, in.window, b, out, scratch);
         assert_memory_equal(a, b, out.width * out.height * sizeof *a);
     }
     free(a);
@@ -157,10 +157,10 @@ static void instructionSetsGiveTheSameBits(void **state)
 static void noiseComesAgainAfterItsPeriod(void **state)
 {
     (void)state;
-    fbm_terrain_step step = make_step();
+    fbm_relief_step step = make_step();
     step.period = 40;
     fbm_window children = {-7, 0, 110, 10, 110};
-    cells in = make_cells(fbm_terrain_support(children));
+    cells in = make_cells(fbm_relief_support(children));
     for (size_t r = 0; r < in.window.height; r++)
         for (size_t c = 40; c < in.window.width; c++) {
             in.heights[r * in.window.stride + c] = in.heights[r * in.window.stride + c - 40];
@@ -184,7 +184,7 @@ static void energyIsThatOfTheDetails(void **state)
     float *scratch = allocate(fbm_energy_scratch(SIDE, SIDE));
     for (size_t k = 0; k < in.width * in.height; k++)
         z[k] = (float)arbitrary(1 << 20) / (1 << 20);
-    fbm_terrain_energy(z, in, energy, out, scratch);
+    fbm_relief_energy(z, in, energy, out, scratch);
     double sum = 0;
     for (size_t k = 0; k < SIDE * SIDE; k++)
         sum += (double)energy[k];
@@ -205,11 +205,11 @@ static void energyLeavesOutWhatIsNotKnown(void **state)
     float *scratch = allocate(fbm_energy_scratch(SIDE, SIDE));
     for (size_t k = 0; k < in.width * in.height; k++)
         z[k] = (float)arbitrary(1 << 20) / (1 << 10);
-    fbm_terrain_energy(z, in, before, out, scratch);
+    fbm_relief_energy(z, in, before, out, scratch);
     for (size_t r = 0; r < in.height; r++)
         for (size_t c = in.width - 20; c < in.width; c++)
             z[r * in.width + c] = NAN;
-    fbm_terrain_energy(z, in, after, out, scratch);
+    fbm_relief_energy(z, in, after, out, scratch);
     for (size_t r = 0; r < SIDE; r++)
         for (size_t c = 0; c < SIDE; c++) {
             /* the voids begin at column 55: cells that see them are those from 55 - 15 on */
@@ -292,18 +292,18 @@ static void octavesGetTheirVariance(void **state)
     free_raster(r);
 }
 
-/* The detail is stronger where the raster is rougher. */
-static void detailFollowsTheRoughnessOfThePlace(void **state)
+/* The detail is stronger where the raster is rougher: of means and of points. */
+static void check_place(tl_raster_type type)
 {
-    (void)state;
     raster r = make_raster(WIDTH, HEIGHT, 1);
+    r.source->info.type = type;
     tl_source *field = tl_field_create(r.source, &(tl_field_options){.levels = 2, .scheme = "terrain"}, NULL);
     assert_non_null(field);
     float *z = read_whole(field);
     double energy[2] = {0, 0};
     int64_t width = field->info.width;
-    for (int64_t y = 0; y < field->info.height; y += 2)
-        for (int64_t x = 0; x < width; x += 2) {
+    for (int64_t y = 0; y + 1 < field->info.height; y += 2)
+        for (int64_t x = 0; x + 1 < width; x += 2) {
             const float *a = z + y * width + x;
             double mixed = (double)a[0] - (double)a[1] - (double)a[width] + (double)a[width + 1];
             if (x < width / 4 || x >= 3 * width / 4)
@@ -312,6 +312,42 @@ static void detailFollowsTheRoughnessOfThePlace(void **state)
     assert_true(energy[1] > 4 * energy[0]);
     free(z);
     tl_source_destroy(field);
+    free_raster(r);
+}
+
+static void detailFollowsTheRoughnessOfThePlace(void **state)
+{
+    (void)state;
+    check_place(TL_RASTER_AREA);
+    check_place(TL_RASTER_POINT);
+}
+
+/* In the middle of the raster a membrane is much smoother than the hills; its detail is not. */
+static void filledVoidsGetTheDetailAround(void **state)
+{
+    (void)state;
+    raster r = make_raster(WIDTH, HEIGHT, 1);
+    for (int64_t y = 110; y < 130; y++)
+        for (int64_t x = 140; x < 160; x++)
+            r.heights[y * WIDTH + x] = NAN;
+    r.source->info.has_voids = true;
+    tl_source *full = tl_voids_create(r.source, &(tl_void_options){.rule = TL_VOIDS_FILL}, NULL);
+    tl_source *field = tl_field_create(full, &(tl_field_options){.levels = 1, .scheme = "terrain"}, NULL);
+    assert_non_null(field);
+    float *z = read_whole(field);
+    double inside = 0, around = 0;
+    int64_t width = field->info.width;
+    for (int64_t y = 2 * 90; y < 2 * 150; y += 2)
+        for (int64_t x = 2 * 120; x < 2 * 180; x += 2) {
+            const float *a = z + y * width + x;
+            double mixed = (double)a[0] - (double)a[1] - (double)a[width] + (double)a[width + 1];
+            bool in = y >= 2 * 112 && y < 2 * 128 && x >= 2 * 142 && x < 2 * 158;
+            *(in ? &inside : &around) += mixed * mixed / (in ? 16 * 16 : 60 * 60 - 16 * 16);
+        }
+    assert_true(inside > .2 * around);
+    free(z);
+    tl_source_destroy(field);
+    tl_source_destroy(full);
     free_raster(r);
 }
 
@@ -356,11 +392,12 @@ static void extremeRastersGiveFiniteHeights(void **state)
 int main(void)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(childrenHaveTheMeanOfTheirCell), cmocka_unit_test(windowsOfChildrenEqualTheWhole),
-        cmocka_unit_test(instructionSetsGiveTheSameBits), cmocka_unit_test(noiseComesAgainAfterItsPeriod),
-        cmocka_unit_test(energyIsThatOfTheDetails),       cmocka_unit_test(energyLeavesOutWhatIsNotKnown),
-        cmocka_unit_test(octavesGetTheirVariance),        cmocka_unit_test(detailFollowsTheRoughnessOfThePlace),
-        cmocka_unit_test(threadsAndScalesDoNotMatter),    cmocka_unit_test(extremeRastersGiveFiniteHeights),
+        cmocka_unit_test(childrenHaveTheMeanOfTheirCell),  cmocka_unit_test(windowsOfChildrenEqualTheWhole),
+        cmocka_unit_test(instructionSetsGiveTheSameBits),  cmocka_unit_test(noiseComesAgainAfterItsPeriod),
+        cmocka_unit_test(energyIsThatOfTheDetails),        cmocka_unit_test(energyLeavesOutWhatIsNotKnown),
+        cmocka_unit_test(octavesGetTheirVariance),         cmocka_unit_test(detailFollowsTheRoughnessOfThePlace),
+        cmocka_unit_test(threadsAndScalesDoNotMatter),     cmocka_unit_test(filledVoidsGetTheDetailAround),
+        cmocka_unit_test(extremeRastersGiveFiniteHeights),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }

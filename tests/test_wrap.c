@@ -121,16 +121,16 @@ static void noiseComesAgainAfterATurn(void **state)
                 float *in = calloc(from.width * from.height, sizeof *in);
                 float *scratch = malloc(sizeof *scratch * fbm_refine_scratch(OUT));
                 static float here[OUT * 9], there[OUT * 9];
-                fbm_refine_by(*kernel, &step, in, from, here, to, scratch);
+                fbm_refine_by(*kernel, &step, in, NULL, from, here, to, scratch);
                 to.i += 2 * PERIOD * turn;
                 from.i += PERIOD * turn;
-                fbm_refine_by(*kernel, &step, in, from, there, to, scratch);
+                fbm_refine_by(*kernel, &step, in, NULL, from, there, to, scratch);
                 assert_memory_equal(here, there, sizeof here);
                 /* and within the window */
                 for (int x = 0; x + 2 * PERIOD < OUT; x++)
                     assert_true(here[x] == here[x + 2 * PERIOD]);
                 step.period = 0;
-                fbm_refine_by(*kernel, &step, in, from, there, to, scratch);
+                fbm_refine_by(*kernel, &step, in, NULL, from, there, to, scratch);
                 assert_true(turn == 0 || memcmp(here, there, sizeof here) != 0);
                 free(in);
                 free(scratch);

@@ -9,10 +9,12 @@ enum { SCENE_LEVEL_MAX = 30 };
 
 typedef struct scene_chain {
     fbm_step steps[SCENE_LEVEL_MAX + 1]; /* steps[l] leads from level l to level l + 1 */
+    bool mapped;                         /* the noise has a strength that varies: `load` tells it */
 } scene_chain;
 
-/* Fills buffer[window.width * window.height] with the heights of level 0, all finite. */
-typedef tl_status (*scene_chain_load)(void *context, fbm_window window, float *buffer, tl_error *error);
+/* Fills buffer[window.width * window.height] with the heights of level 0, all finite, and `map`, unless NULL, with the
+ * factors on the noise there. */
+typedef tl_status (*scene_chain_load)(void *context, fbm_window window, float *buffer, float *map, tl_error *error);
 
 /* Where the heights of one call go: the samples of a lattice, or the centres of its cells (see fbm_centres). */
 typedef struct scene_chain_target {

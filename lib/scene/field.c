@@ -27,7 +27,7 @@ typedef struct field {
     const tl_source *dem;
     const char *scheme;
     scene_chain chain;
-    scene_terrain *terrain; /* of cell means; NULL: the chain makes everything */
+    scene_terrain *terrain; /* of cell means, or the strengths of the chain's noise; NULL: neither */
     float trend;            /* how far a slope goes on beyond the rim: see scene_growth */
     tl_parameter *parameters;
 } field;
@@ -51,13 +51,46 @@ static void cut_voids(const scene_patch *g, bool area, int level, tl_window wind
 
 /* ---- reading ---- */
 
-static tl_status load(void *context, fbm_window window, float *buffer, tl_error *error)
+/* Level 0 under a block: a patch that may reach farther than the chain asks for, and the strengths of the noise. */
+typedef struct ground {
+    scene_patch patch;
+    float *strengths; /* of the window that the chain asks for */
+} ground;
+
+static tl_status load(void *context, fbm_window window, float *buffer, float *map, tl_error *error)
 {
     (void)error;
-    const scene_patch *g = context;
-    assert(window.i == g->window.i && window.width == g->window.width && window.height == g->window.height);
-    memcpy(buffer, g->heights, window.width * window.height * sizeof *buffer);
+    const ground *g = context;
+    const fbm_window *w = &g->patch.window;
+    assert(window.i >= w->i && window.j >= w->j && window.width <= w->width && window.height <= w->height);
+    const float *from = g->patch.heights + (size_t)(window.j - w->j) * w->width + (size_t)(window.i - w->i);
+    for (size_t row = 0; row < window.height; row++)
+        memcpy(buffer + row * window.width, from + row * w->width, window.width * sizeof *buffer);
+    if (map)
+        memcpy(map, g->strengths, window.width * window.height * sizeof *map);
     return TL_OK;
+}
+
+static tl_status ground_read(const field *f, fbm_window window, ground *g, tl_error *error)
+{
+    const char *name = f->dem->info.name;
+    scene_growth growth = {.rings = GROWTH, .trend = f->trend};
+    *g = (ground){.strengths = NULL};
+    if (!f->chain.mapped)
+        return scene_patch_read(f->dem, growth, window, &g->patch, error);
+    tl_status status = scene_patch_read(f->dem, growth, scene_widened(window, FBM_ENERGY_MARGIN), &g->patch, error);
+    if (status == TL_OK) {
+        g->strengths = tl_alloc_grid((int64_t)window.width, (int64_t)window.height, sizeof *g->strengths);
+        status = g->strengths ? scene_terrain_strengths(f->terrain, &g->patch, window, g->strengths, name, error)
+                              : tl_fail_memory(error, name);
+    }
+    return status;
+}
+
+static void ground_free(ground *g)
+{
+    scene_patch_free(&g->patch);
+    free(g->strengths);
 }
 
 /* The lattice window, or the window of cells, that a window of samples is. Cell k of an area raster at level l has its
@@ -88,19 +121,18 @@ static tl_status read_terrain(const field *f, int level, tl_window window, float
 
 static tl_status read_block(const field *f, int level, tl_window window, float *out, int64_t stride, tl_error *error)
 {
-    if (f->terrain)
+    if (f->terrain && !f->chain.mapped)
         return read_terrain(f, level, window, out, stride, error);
     scene_chain_target target = target_of(f, level, window, out, stride);
     fbm_window support = scene_chain_support(&f->chain, &target);
     support.stride = support.width;
-    scene_patch g;
-    tl_status status = scene_patch_read(f->dem, (scene_growth){.rings = GROWTH, .trend = f->trend}, support, &g, error);
-    if (status != TL_OK)
-        return status;
-    status = scene_chain_run(&f->chain, &target, load, &g, f->source.info.name, error);
-    if (status == TL_OK && g.known)
-        cut_voids(&g, f->source.info.type == TL_RASTER_AREA, level, window, out, stride);
-    scene_patch_free(&g);
+    ground g;
+    tl_status status = ground_read(f, support, &g, error);
+    if (status == TL_OK)
+        status = scene_chain_run(&f->chain, &target, load, &g, f->source.info.name, error);
+    if (status == TL_OK && g.patch.known)
+        cut_voids(&g.patch, f->source.info.type == TL_RASTER_AREA, level, window, out, stride);
+    ground_free(&g);
     return status;
 }
 
@@ -296,11 +328,14 @@ static tl_status prepare(field *f, const tl_field_options *o, tl_error *error)
     schedule(f, o, &measured, octaves);
     set_steps(f, o, octaves);
     place(f, o->levels);
-    if (terrain && o->levels > 0 && f->dem->info.type == TL_RASTER_AREA) {
+    if (terrain && o->levels > 0) {
         f->terrain = malloc(sizeof *f->terrain);
         if (!f->terrain)
             return tl_fail_memory(error, f->dem->info.name);
-        status = scene_terrain_measure(f->dem, &detail, octaves, o->levels, o->seed, o->run, f->terrain, error);
+        f->chain.mapped = f->dem->info.type == TL_RASTER_POINT; /* its samples stay: the lattice is refined */
+        status = f->chain.mapped
+                     ? scene_terrain_measure_strengths(f->dem, &detail, octaves, o->run, f->terrain, error)
+                     : scene_terrain_measure(f->dem, &detail, octaves, o->levels, o->seed, o->run, f->terrain, error);
     }
     return status == TL_OK ? note_all(f, o, &measured, error) : status;
 }

@@ -27,8 +27,9 @@ typedef struct noise {
     tl_parameter *parameters;
 } noise;
 
-static tl_status load(void *context, fbm_window window, float *buffer, tl_error *error)
+static tl_status load(void *context, fbm_window window, float *buffer, float *map, tl_error *error)
 {
+    (void)map;
     (void)error;
     const noise *n = context;
     int64_t i = window.i + HALO, j = window.j + HALO;

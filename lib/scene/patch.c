@@ -155,8 +155,8 @@ static tl_status read_reflected(const tl_source *dem, fbm_window w, float *out, 
 
 /* ---- Growth ---- */
 
-/* States of a sample: REFLECTED and what is below are known to begin with, FIRST_RING + p - 1 is that of pass p. */
-enum { UNKNOWN, MODEL, REFLECTED, FIRST_RING };
+/* Further states of a sample: SCENE_BEYOND (reflected) and what is below are known to begin with. */
+enum { UNKNOWN = SCENE_NOTHING, FIRST_RING = SCENE_BEYOND + 1 };
 
 /* The height of an unknown sample, from its neighbours whose state is below `state`: the mean, over the eight
  * directions, of the nearest height and `trend` times the step to it. For fBm on a line the best guess behind two known
@@ -253,6 +253,44 @@ static void crop(const scene_patch *wide, scene_patch *g)
     }
 }
 
+/* Marks the samples of rows y0 ... y1 - 1 and columns x0 ... x1 - 1 that were filled; `x` is the first of these columns
+ * in the model. */
+static tl_status mark_filled_part(const tl_source *dem, scene_patch *g, int64_t x0, int64_t x1, int64_t x, int64_t y0,
+                                  int64_t y1, tl_error *error)
+{
+    tl_window part = {x, y0, x1 - x0, y1 - y0};
+    unsigned char *validity = tl_alloc_grid(part.width, part.height, 1);
+    if (!validity)
+        return tl_fail_memory(error, dem->info.name);
+    tl_status status = tl_source_validity(dem, 0, part, validity, error);
+    for (int64_t k = 0; status == TL_OK && k < part.width * part.height; k++) {
+        size_t at =
+            (size_t)(y0 + k / part.width - g->window.j) * g->window.width + (size_t)(x0 + k % part.width - g->window.i);
+        if (validity[k] == TL_FILLED && g->known[at] == SCENE_MODEL)
+            g->known[at] = SCENE_FILLED;
+    }
+    free(validity);
+    return status;
+}
+
+static tl_status mark_filled(const tl_source *dem, scene_patch *g, tl_error *error)
+{
+    const tl_source_info *info = &dem->info;
+    int64_t y0 = tl_int64_max(g->window.j, 0), y1 = tl_int64_min(g->window.j + (int64_t)g->window.height, info->height);
+    int64_t x0 = g->window.i, x1 = g->window.i + (int64_t)g->window.width;
+    if (!info->wraps) {
+        x0 = tl_int64_max(x0, 0);
+        x1 = tl_int64_min(x1, info->width);
+    }
+    tl_status status = TL_OK;
+    for (int64_t n; x0 < x1 && y0 < y1 && status == TL_OK; x0 += n) { /* once, or around the globe */
+        int64_t x = (x0 % info->width + info->width) % info->width;
+        n = tl_int64_min(info->width - x, x1 - x0);
+        status = mark_filled_part(dem, g, x0, x0 + n, x, y0, y1, error);
+    }
+    return status;
+}
+
 /* Reads a window with what is reflected, and tells what is known; UNKNOWN are voids. */
 static tl_status read_known(const tl_source *dem, bool reflect, scene_patch *g, bool *all, tl_error *error)
 {
@@ -262,10 +300,10 @@ static tl_status read_known(const tl_source *dem, bool reflect, scene_patch *g, 
     for (size_t k = 0; k < w.width * w.height && status == TL_OK; k++) {
         int64_t x = w.i + (int64_t)(k % w.width), y = w.j + (int64_t)(k / w.width);
         bool model = y >= 0 && y < dem->info.height && (dem->info.wraps || (x >= 0 && x < dem->info.width));
-        g->known[k] = isnan(g->heights[k]) ? UNKNOWN : model ? MODEL : REFLECTED;
+        g->known[k] = isnan(g->heights[k]) ? UNKNOWN : model ? SCENE_MODEL : SCENE_BEYOND;
         *all = *all && g->known[k];
     }
-    return status;
+    return status == TL_OK && dem->validity ? mark_filled(dem, g, error) : status;
 }
 
 static tl_status grow_patch(scene_growth growth, scene_patch *g, const char *name, tl_error *error)
@@ -285,10 +323,10 @@ static tl_status read_with_rim(const tl_source *dem, scene_growth growth, fbm_wi
 {
     const char *name = dem->info.name;
     bool all = false;
-    if (growth.reflect) { /* without voids that is all */
+    if (growth.reflect || dem->validity) { /* without voids that is all */
         tl_status status = allocate(g, w, true, name, error);
         if (status == TL_OK)
-            status = read_known(dem, true, g, &all, error);
+            status = read_known(dem, growth.reflect, g, &all, error);
         if (status != TL_OK || all) {
             if (status != TL_OK)
                 scene_patch_free(g);
@@ -325,7 +363,7 @@ tl_status scene_patch_read(const tl_source *dem, scene_growth growth, fbm_window
         tl_status status = allocate(g, w, false, dem->info.name, error);
         if (status == TL_OK)
             status = read_ground(dem, w, g->heights, error);
-        if (status == TL_OK && all_known(g->heights, w.width * w.height))
+        if (status == TL_OK && !dem->validity && all_known(g->heights, w.width * w.height))
             return status;
         scene_patch_free(g);
         if (status != TL_OK)

@@ -9,8 +9,15 @@
 typedef struct scene_patch {
     fbm_window window;    /* without gaps between rows */
     float *heights;       /* all finite */
-    unsigned char *known; /* 1 where the height is the model's; NULL: everywhere */
+    unsigned char *known; /* a scene_known for each; NULL: all are SCENE_MODEL */
 } scene_patch;
+
+typedef enum scene_known {
+    SCENE_NOTHING = 0,
+    SCENE_MODEL,  /* the model's own */
+    SCENE_FILLED, /* the model's, but made up in a void: smoother than what is around */
+    SCENE_BEYOND, /* and all that follows: not the model's */
+} scene_known;
 
 /* How heights are made up. First, if `reflect`, beyond the raster's rim: by odd reflection there, z(-k) = 2 z(0) -
  * z(k). Then ring by ring, for `rings` rings around the known samples, each the mean over directions of the neighbour's
@@ -26,9 +33,12 @@ tl_status scene_patch_read(const tl_source *dem, scene_growth growth, fbm_window
                            tl_error *error);
 void scene_patch_free(scene_patch *patch);
 
+/* Whether a sample is the model's, filled or not. */
 static inline bool scene_patch_known(const scene_patch *p, int64_t i, int64_t j)
 {
-    return !p->known || p->known[(size_t)(j - p->window.j) * p->window.width + (size_t)(i - p->window.i)] == 1;
+    unsigned char known =
+        p->known ? p->known[(size_t)(j - p->window.j) * p->window.width + (size_t)(i - p->window.i)] : SCENE_MODEL;
+    return known == SCENE_MODEL || known == SCENE_FILLED;
 }
 
 /* The window with `by` samples more on every side. */

@@ -74,7 +74,7 @@ static void add(fbm_detail *sum, const fbm_detail *part)
     sum->count += part->count;
 }
 
-/* The exponent that real terrain has at this ratio of its finest detail to the cell: fbm/terrain.h's rule. */
+/* The exponent that real terrain has at this ratio of its finest detail to the cell: fbm/relief.h's rule. */
 static double usual_hurst(double ratio)
 {
     return 1.191 + .266 * (ratio + 5);

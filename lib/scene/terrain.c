@@ -32,7 +32,8 @@ static void normalise_energy(const scene_terrain *t, float *energy, size_t count
     }
 }
 
-/* Makes what is not known NaN in a copy, and measures energies on it. */
+/* Makes what was not measured NaN in a copy, and measures energies on it: a filled void is as rough as its
+ * surroundings, or where they are far, as the mean. */
 static tl_status patch_energy(const scene_terrain *t, const scene_patch *patch, fbm_window window, float *out,
                               const char *name, tl_error *error)
 {
@@ -42,8 +43,8 @@ static tl_status patch_energy(const scene_terrain *t, const scene_patch *patch, 
     tl_status status = heights && scratch ? TL_OK : tl_fail_memory(error, name);
     if (status == TL_OK) {
         for (size_t k = 0; patch->known && k < samples; k++)
-            heights[k] = patch->known[k] == 1 ? patch->heights[k] : NAN;
-        fbm_terrain_energy(heights, patch->window, out, window, scratch);
+            heights[k] = patch->known[k] == SCENE_MODEL ? patch->heights[k] : NAN;
+        fbm_relief_energy(heights, patch->window, out, window, scratch);
         normalise_energy(t, out, window.width * window.height);
     }
     free(scratch);
@@ -55,7 +56,7 @@ static tl_status patch_energy(const scene_terrain *t, const scene_patch *patch, 
 /* Heights and energies of a window of some level. */
 typedef struct layer {
     fbm_window window;
-    float *heights, *energy;
+    float *heights, *energy; /* and slacks behind the energies */
 } layer;
 
 static tl_status layer_init(layer *l, fbm_window window, const char *name, tl_error *error)
@@ -63,9 +64,20 @@ static tl_status layer_init(layer *l, fbm_window window, const char *name, tl_er
     size_t samples;
     *l = (layer){.window = window};
     bool fits = tl_size_mul(window.width, window.height, &samples);
-    l->heights = fits ? tl_alloc(samples, 2 * sizeof(float)) : NULL;
+    l->heights = fits ? tl_alloc(samples, 3 * sizeof(float)) : NULL;
     l->energy = l->heights ? l->heights + samples : NULL;
     return l->heights ? TL_OK : tl_fail_memory(error, name);
+}
+
+/* What was filled is not as level as it looks: there the slopes of the steeper half are taken for its own. */
+static void set_slacks(const scene_terrain *t, const scene_patch *patch, fbm_window window, float *out)
+{
+    for (size_t r = 0; r < window.height; r++)
+        for (size_t c = 0; c < window.width; c++) {
+            size_t at = (r + (size_t)(window.j - patch->window.j)) * patch->window.width + c +
+                        (size_t)(window.i - patch->window.i);
+            out[r * window.width + c] = patch->known && patch->known[at] == SCENE_FILLED ? t->filled_slope2 : 0;
+        }
 }
 
 /* Level 0 of a window; `patch` holds FBM_ENERGY_MARGIN more. */
@@ -78,6 +90,8 @@ static tl_status layer_read(const scene_terrain *t, const tl_source *dem, fbm_wi
     status = layer_init(l, window, dem->info.name, error);
     if (status == TL_OK)
         status = patch_energy(t, patch, window, l->energy, dem->info.name, error);
+    if (status == TL_OK)
+        set_slacks(t, patch, window, l->energy + window.width * window.height);
     for (size_t r = 0; status == TL_OK && r < window.height; r++)
         memcpy(l->heights + r * window.width,
                patch->heights + (r + FBM_ENERGY_MARGIN) * patch->window.width + FBM_ENERGY_MARGIN,
@@ -86,16 +100,16 @@ static tl_status layer_read(const scene_terrain *t, const tl_source *dem, fbm_wi
 }
 
 /* Replaces a layer by a window of its children. */
-static tl_status layer_refine(const fbm_terrain_step *step, layer *l, fbm_window children, const char *name,
+static tl_status layer_refine(const fbm_relief_step *step, layer *l, fbm_window children, const char *name,
                               tl_error *error)
 {
     layer finer;
     tl_status status = layer_init(&finer, children, name, error);
-    float *scratch = tl_alloc(fbm_terrain_scratch(children.width, children.height), sizeof *scratch);
+    float *scratch = tl_alloc(fbm_relief_scratch(children.width, children.height), sizeof *scratch);
     if (status == TL_OK && !scratch)
         status = tl_fail_memory(error, name);
     if (status == TL_OK) {
-        fbm_terrain_refine(step, l->heights, l->energy, l->window, finer.heights, finer.energy, children, scratch);
+        fbm_relief_refine(step, l->heights, l->energy, l->window, finer.heights, finer.energy, children, scratch);
         free(l->heights);
         *l = finer;
     } else
@@ -110,7 +124,7 @@ static void plan(fbm_window *windows, int level, fbm_window window)
     window.stride = window.width;
     windows[level] = window;
     for (; level > 0; level--)
-        windows[level - 1] = fbm_terrain_support(windows[level]);
+        windows[level - 1] = fbm_relief_support(windows[level]);
 }
 
 /* Makes levels 1 ... `level` of a plan, from level 0 on. */
@@ -131,11 +145,11 @@ tl_status scene_terrain_read(const scene_terrain *t, const tl_source *dem, int l
     layer l = {.heights = NULL};
     scene_patch ground = {.heights = NULL};
     tl_status status = descend(t, dem, windows, level - 1, &l, &ground, error);
-    float *scratch = tl_alloc(fbm_terrain_scratch(window.width, window.height), sizeof *scratch);
+    float *scratch = tl_alloc(fbm_relief_scratch(window.width, window.height), sizeof *scratch);
     if (status == TL_OK && !scratch)
         status = tl_fail_memory(error, dem->info.name);
     if (status == TL_OK)
-        fbm_terrain_refine(&t->steps[level - 1], l.heights, l.energy, l.window, out, NULL, target, scratch);
+        fbm_relief_refine(&t->steps[level - 1], l.heights, l.energy, l.window, out, NULL, target, scratch);
     free(scratch);
     free(l.heights);
     if (status == TL_OK && patch)
@@ -178,15 +192,14 @@ static fbm_window spot_window(const tl_source_info *dem, const spots *s, uint64_
     return w;
 }
 
-/* Sums over the cells of a spot, of its energies (mean 1) and of the square amplitudes of each octave. */
+/* Sums over the cells of a spot, or under its children: of energies (mean 1), of square slopes and of the square
+ * amplitudes of each octave. */
 typedef struct spot_sums {
-    double energy, amplitudes[CALIBRATED];
+    double energy, cell_slope2, amplitudes[CALIBRATED];
     uint64_t cells;
     double slope2[4], slope_count; /* of the predictions from the means of every offset */
-    fbm_terrain_fit fit;
-    fbm_terrain_sums sums;
-    double cells_amplitude; /* of the cells under a calibrated spot */
-    uint64_t amplitude_cells;
+    fbm_relief_fit fit;
+    fbm_relief_sums sums;
 } spot_sums;
 
 typedef struct survey {
@@ -204,7 +217,7 @@ typedef struct survey {
 static double cell_slope2(const survey *s, const layer *l, size_t at)
 {
     const float *z = l->heights + at;
-    const fbm_terrain_step *step = &s->terrain->steps[0];
+    const fbm_relief_step *step = &s->terrain->steps[0];
     double x = ((double)z[1] - (double)z[-1]) / (4 * (double)step->children_x);
     double y = ((double)z[l->window.width] - (double)z[-(ptrdiff_t)l->window.width]) / (4 * (double)step->children_y);
     return x * x + y * y;
@@ -216,8 +229,8 @@ static double amplitude2(double energy, double slope2, double limit)
 }
 
 /* Adds energies and amplitudes of the known cells that lie at least a cell inside of the layer. */
-static void add_amplitudes(const survey *s, const layer *l, const scene_patch *patch, int first, int last, double *sums,
-                           double *energy, uint64_t *cells)
+static void add_amplitudes(const survey *s, const layer *l, const scene_patch *patch, int first, int last,
+                           spot_sums *sums)
 {
     for (size_t r = 1; r + 1 < l->window.height; r++)
         for (size_t c = 1; c + 1 < l->window.width; c++) {
@@ -226,9 +239,10 @@ static void add_amplitudes(const survey *s, const layer *l, const scene_patch *p
                 continue;
             double slope2 = cell_slope2(s, l, at), e = (double)l->energy[at];
             for (int k = first; k <= last; k++)
-                sums[k - first] += amplitude2(e, slope2, (double)s->terrain->steps[k].limit);
-            *energy += e;
-            ++*cells;
+                sums->amplitudes[k] += amplitude2(e, slope2, (double)s->terrain->steps[k].limit);
+            sums->energy += e;
+            sums->cell_slope2 += slope2;
+            sums->cells++;
         }
 }
 
@@ -243,7 +257,7 @@ static tl_status survey_amplitudes(void *context, tl_parallel *loop, uint64_t it
     scene_patch patch = {.heights = NULL};
     tl_status status = layer_read(s->terrain, s->dem, scene_widened(window, 1), &l, &patch, error);
     if (status == TL_OK)
-        add_amplitudes(s, &l, &patch, 0, CALIBRATED - 1, sums->amplitudes, &sums->energy, &sums->cells);
+        add_amplitudes(s, &l, &patch, 0, CALIBRATED - 1, sums);
     free(l.heights);
     scene_patch_free(&patch);
     return status;
@@ -285,20 +299,20 @@ static tl_status spot_means_init(const survey *s, uint64_t item, spot_means *m, 
     *m = (spot_means){.children = {0, 0, width, height, width}, .x = spot.i, .y = spot.j};
     if (width == 0 || height == 0)
         return TL_OK;
-    m->window = fbm_terrain_support(m->children);
+    m->window = fbm_relief_support(m->children);
     m->means = tl_alloc_grid((int64_t)m->window.width, (int64_t)m->window.height, sizeof *m->means);
-    m->scratch = tl_alloc(fbm_terrain_scratch(width, height), sizeof *m->scratch);
+    m->scratch = tl_alloc(fbm_relief_scratch(width, height), sizeof *m->scratch);
     if (!m->means || !m->scratch)
         return tl_fail_memory(error, name);
-    return scene_patch_read(s->dem, s->terrain->growth, scene_widened(spot, 2 * FBM_TERRAIN_MARGIN + 2), &m->patch,
+    return scene_patch_read(s->dem, s->terrain->growth, scene_widened(spot, 2 * FBM_RELIEF_MARGIN + 2), &m->patch,
                             error);
 }
 
 /* The refinement of the means: a step whose parents are 2 x 2 samples. */
-static fbm_terrain_step means_step(const survey *s)
+static fbm_relief_step means_step(const survey *s)
 {
-    const fbm_terrain_step *finest = &s->terrain->steps[0];
-    fbm_terrain_step step = {.children_x = 2 * finest->children_x, .children_y = 2 * finest->children_y};
+    const fbm_relief_step *finest = &s->terrain->steps[0];
+    fbm_relief_step step = {.children_x = 2 * finest->children_x, .children_y = 2 * finest->children_y};
     step.level = 4 * step.children_x * step.children_y / 5;
     step.level_slope = (float)s->slope_rms;
     return step;
@@ -310,12 +324,12 @@ static tl_status survey_slopes(void *context, tl_parallel *loop, uint64_t item, 
     const survey *s = context;
     spot_means m;
     tl_status status = spot_means_init(s, item, &m, error);
-    const fbm_terrain_step step = means_step(s);
+    const fbm_relief_step step = means_step(s);
     for (int offset = 0; offset < 4 && status == TL_OK && m.means; offset++) {
         block_means(&m.patch, m.x + offset % 2, m.y + offset / 2, m.window, m.means);
         fbm_slopes *slopes = &s->slopes[worker];
         slopes->sum = 0;
-        fbm_terrain_add_slopes(&step, m.means, m.window, m.children, m.scratch, slopes);
+        fbm_relief_add_slopes(&step, m.means, m.window, m.children, m.scratch, slopes);
         s->each[item].slope2[offset] = slopes->sum;
         s->each[item].slope_count += (double)(m.children.width * m.children.height);
     }
@@ -330,7 +344,7 @@ static tl_status survey_fit(void *context, tl_parallel *loop, uint64_t item, uns
     const survey *s = context;
     spot_means m;
     tl_status status = spot_means_init(s, item, &m, error);
-    const fbm_terrain_step step = means_step(s);
+    const fbm_relief_step step = means_step(s);
     for (int offset = 0; offset < 4 && status == TL_OK && m.means; offset++) {
         int64_t i = m.x + offset % 2, j = m.y + offset / 2;
         block_means(&m.patch, i, j, m.window, m.means);
@@ -338,8 +352,8 @@ static tl_status survey_fit(void *context, tl_parallel *loop, uint64_t item, uns
         children.stride = m.patch.window.width;
         const float *samples =
             m.patch.heights + (size_t)(j - m.patch.window.j) * m.patch.window.width + (size_t)(i - m.patch.window.i);
-        fbm_terrain_add_fit(&step, m.means, m.window, samples, children, s->shares, s->steep, m.scratch,
-                            &s->each[item].fit);
+        fbm_relief_add_fit(&step, m.means, m.window, samples, children, s->shares, s->steep, m.scratch,
+                           &s->each[item].fit);
     }
     spot_means_finish(&m);
     return status;
@@ -378,10 +392,11 @@ static tl_status fit_slopes(survey *s, const tl_run *run, tl_error *error)
     }
     s->slope_rms = samples > 0 ? sqrt(sum / samples) : 0;
     s->steep = median_of_workers(s->slopes, workers);
+    s->terrain->filled_slope2 = (float)fmin(4 * s->steep, 1e15);
     status = tl_parallel_for(run, count, 0, survey_fit, s, error);
-    fbm_terrain_fit fit = {0};
+    fbm_relief_fit fit = {0};
     for (uint64_t i = 0; status == TL_OK && i < count; i++) {
-        const fbm_terrain_fit *each = &s->each[i].fit;
+        const fbm_relief_fit *each = &s->each[i].fit;
         fit.stretch += each->stretch;
         fit.energy += each->energy;
         fit.levelled += each->levelled;
@@ -406,13 +421,13 @@ static tl_status calibrate_slopes(void *context, tl_parallel *loop, uint64_t ite
     layer l = {.heights = NULL};
     scene_patch patch = {.heights = NULL};
     tl_status status = descend(s->terrain, s->dem, windows, s->octave, &l, &patch, error);
-    float *scratch = tl_alloc(fbm_terrain_scratch(children.width, children.height), sizeof *scratch);
+    float *scratch = tl_alloc(fbm_relief_scratch(children.width, children.height), sizeof *scratch);
     if (status == TL_OK && !scratch)
         status = tl_fail_memory(error, s->dem->info.name);
     if (status == TL_OK) {
         fbm_slopes *slopes = &s->slopes[worker];
         slopes->sum = 0;
-        fbm_terrain_add_slopes(&s->terrain->steps[s->octave], l.heights, l.window, children, scratch, slopes);
+        fbm_relief_add_slopes(&s->terrain->steps[s->octave], l.heights, l.window, children, scratch, slopes);
         s->each[item].slope2[0] = slopes->sum;
         s->each[item].slope_count = (double)(children.width * children.height);
     }
@@ -443,21 +458,18 @@ static tl_status calibrate_sums(void *context, tl_parallel *loop, uint64_t item,
     layer l = {.heights = NULL}, ground = {.heights = NULL};
     scene_patch patch = {.heights = NULL}, under = {.heights = NULL};
     tl_status status = descend(s->terrain, s->dem, windows, s->octave, &l, &patch, error);
-    float *scratch = tl_alloc(fbm_terrain_scratch(children.width, children.height), sizeof *scratch);
+    float *scratch = tl_alloc(fbm_relief_scratch(children.width, children.height), sizeof *scratch);
     if (status == TL_OK && !scratch)
         status = tl_fail_memory(error, s->dem->info.name);
     spot_sums *sums = &s->each[item];
     if (status == TL_OK) {
-        fbm_terrain_add_sums(&s->terrain->steps[s->octave], l.heights, l.energy, l.window, children, scratch,
-                             &sums->sums);
+        fbm_relief_add_sums(&s->terrain->steps[s->octave], l.heights, l.energy, l.window, children, scratch,
+                            &sums->sums);
         status = layer_read(s->terrain, s->dem, scene_widened(cells_under(children, s->octave + 1), 1), &ground, &under,
                             error);
     }
-    if (status == TL_OK) {
-        double energy = 0;
-        add_amplitudes(s, &ground, &under, s->octave, s->octave, &sums->cells_amplitude, &energy,
-                       &sums->amplitude_cells);
-    }
+    if (status == TL_OK)
+        add_amplitudes(s, &ground, &under, s->octave, s->octave, sums);
     free(scratch);
     free(l.heights);
     free(ground.heights);
@@ -473,7 +485,7 @@ typedef struct response {
 
 static response gather_response(const survey *s, uint64_t count)
 {
-    fbm_terrain_sums sum = {{0}, {0}, 0};
+    fbm_relief_sums sum = {{0}, {0}, 0};
     double amplitude = 0;
     uint64_t cells = 0;
     for (uint64_t i = 0; i < count; i++) {
@@ -483,8 +495,8 @@ static response gather_response(const survey *s, uint64_t count)
             sum.levelling[d] += each->sums.levelling[d];
         }
         sum.count += each->sums.count;
-        amplitude += each->cells_amplitude;
-        cells += each->amplitude_cells;
+        amplitude += each->amplitudes[s->octave];
+        cells += each->cells;
     }
     response r = {{0}, {0}};
     if (!(amplitude > 0) || !sum.count)
@@ -515,7 +527,7 @@ static tl_status calibrate_octave(survey *s, int octave, const tl_run *run, resp
         sum += s->each[i].slope2[0];
         samples += s->each[i].slope_count;
     }
-    fbm_terrain_step *step = &s->terrain->steps[octave];
+    fbm_relief_step *step = &s->terrain->steps[octave];
     step->level_slope = (float)sqrt(sum / samples);
     step->steer_slope2 = (float)median_of_workers(s->slopes, workers);
     status = tl_parallel_for(run, count, 0, calibrate_sums, s, error);
@@ -535,7 +547,7 @@ static void share_out(double hurst, double log_aspect, double excess, double sha
     shares[2] = mixed / sum;
 }
 
-static void set_gains(fbm_terrain_step *step, const response *r, double amplitude, double variance,
+static void set_gains(fbm_relief_step *step, const response *r, double amplitude, double variance,
                       const double shares[3])
 {
     for (int d = 0; d < 3; d++) {
@@ -550,15 +562,16 @@ static void set_geometry(scene_terrain *t, const tl_source *dem, const scene_oct
     const tl_georef *g = &dem->info.georef;
     double x = g->cell_x / g->height_unit, y = g->cell_y / g->height_unit, fading = 1;
     for (int l = 0; l < levels; l++, x /= 2, y /= 2, fading *= .85) {
-        fbm_terrain_step *step = &t->steps[l];
-        *step = (fbm_terrain_step){.children_x = (float)(x / 2),
-                                   .children_y = (float)(y / 2),
-                                   .steer = (float)(4 * t->steering * fading),
-                                   .level = (float)(x * y / 5 * t->levelling * fading),
-                                   .limit = (float)(16 * octaves[l].sigma * octaves[l].sigma / (x * y)),
-                                   .seed = seed,
-                                   .octave = l,
-                                   .period = dem->info.wraps ? dem->info.width << l : 0};
+        fbm_relief_step *step = &t->steps[l];
+        *step = (fbm_relief_step){.children_x = (float)(x / 2),
+                                  .children_y = (float)(y / 2),
+                                  .steer = (float)(4 * t->steering * fading),
+                                  .level = (float)(x * y / 5 * t->levelling * fading),
+                                  .limit = (float)(16 * octaves[l].sigma * octaves[l].sigma / (x * y)),
+                                  .seed = seed,
+                                  .octave = l,
+                                  .slack = dem->validity != NULL,
+                                  .period = dem->info.wraps ? dem->info.width << l : 0};
     }
 }
 
@@ -587,7 +600,7 @@ static tl_status calibrate(survey *s, const scene_detail *detail, const scene_oc
         means[l] = mean_amplitude(s, count, l);
     response r = {{0}, {0}};
     for (int l = 0; l < levels && status == TL_OK; l++) {
-        fbm_terrain_step *step = &s->terrain->steps[l];
+        fbm_relief_step *step = &s->terrain->steps[l];
         excess *= .7;
         if (l < CALIBRATED)
             status = calibrate_octave(s, l, run, &r, error);
@@ -604,18 +617,25 @@ static tl_status calibrate(survey *s, const scene_detail *detail, const scene_oc
     return status;
 }
 
-tl_status scene_terrain_measure(const tl_source *dem, const scene_detail *detail, const scene_octave *octaves,
-                                int levels, uint64_t seed, const tl_run *run, scene_terrain *out, tl_error *error)
+/* What is known before a survey. */
+static survey begin_survey(const tl_source *dem, const scene_detail *detail, scene_terrain *t)
 {
     const fbm_detail *finest = &detail->octaves[0];
     double blocks = finest->count ? (double)finest->count : 1;
-    *out = (scene_terrain){.growth = {.rings = RINGS, .trend = .9f, .reflect = true}};
-    out->mean_energy = fbm_detail_variance(finest, 0, detail->noise);
-    out->noise_energy = (finest->x + finest->y + finest->mixed) / blocks - out->mean_energy;
-    set_geometry(out, dem, octaves, levels > CALIBRATED ? levels : CALIBRATED, seed);
-    survey s = {.terrain = out, .dem = dem, .spots = choose_spots(&dem->info, SPOT_CELLS)};
+    *t = (scene_terrain){.growth = {.rings = RINGS, .trend = .9f, .reflect = true}};
+    t->mean_energy = fbm_detail_variance(finest, 0, detail->noise);
+    t->noise_energy = (finest->x + finest->y + finest->mixed) / blocks - t->mean_energy;
+    survey s = {.terrain = t, .dem = dem, .spots = choose_spots(&dem->info, SPOT_CELLS)};
     s.shares[0] = finest->x / blocks;
     s.shares[1] = finest->y / blocks;
+    return s;
+}
+
+tl_status scene_terrain_measure(const tl_source *dem, const scene_detail *detail, const scene_octave *octaves,
+                                int levels, uint64_t seed, const tl_run *run, scene_terrain *out, tl_error *error)
+{
+    survey s = begin_survey(dem, detail, out);
+    set_geometry(out, dem, octaves, levels > CALIBRATED ? levels : CALIBRATED, seed);
     tl_run quiet = run ? *run : (tl_run){0};
     quiet.progress = NULL; /* the reading before took the time */
     unsigned workers = tl_parallel_workers(run, SPOTS * SPOTS);
@@ -630,5 +650,54 @@ tl_status scene_terrain_measure(const tl_source *dem, const scene_detail *detail
     }
     free(s.slopes);
     free(s.each);
+    return status;
+}
+
+/* ---- Strengths alone ---- */
+
+tl_status scene_terrain_measure_strengths(const tl_source *dem, const scene_detail *detail, const scene_octave *octaves,
+                                          const tl_run *run, scene_terrain *out, tl_error *error)
+{
+    survey s = begin_survey(dem, detail, out);
+    set_geometry(out, dem, octaves, CALIBRATED, 0);
+    tl_run quiet = run ? *run : (tl_run){0};
+    quiet.progress = NULL;
+    uint64_t count = (uint64_t)(s.spots.columns * s.spots.rows);
+    s.each = calloc(count, sizeof *s.each);
+    if (!s.each)
+        return tl_fail_memory(error, dem->info.name);
+    tl_status status = tl_parallel_for(&quiet, count, 0, survey_amplitudes, &s, error);
+    out->mean_amplitude = mean_amplitude(&s, count, 0);
+    double slope2 = 0, cells = 0;
+    for (uint64_t i = 0; i < count; i++) {
+        slope2 += s.each[i].cell_slope2;
+        cells += (double)s.each[i].cells;
+    }
+    out->filled_slope2 = cells > 0 ? (float)fmin(slope2 / cells, 1e15) : 0;
+    free(s.each);
+    return status;
+}
+
+tl_status scene_terrain_strengths(const scene_terrain *t, const scene_patch *patch, fbm_window window, float *out,
+                                  const char *name, tl_error *error)
+{
+    tl_status status = patch_energy(t, patch, window, out, name, error);
+    const fbm_relief_step *step = &t->steps[0];
+    const float per_x = 1 / (4 * step->children_x), per_y = 1 / (4 * step->children_y), limit = step->limit;
+    const float per_mean = t->mean_amplitude > 0 ? (float)(1 / t->mean_amplitude) : 0;
+    const size_t stride = patch->window.width, x0 = (size_t)(window.i - patch->window.i);
+    for (size_t r = 0; r < window.height && status == TL_OK; r++) {
+        const float *z = patch->heights + (r + (size_t)(window.j - patch->window.j)) * stride + x0;
+        const unsigned char *known = patch->known ? patch->known + (z - patch->heights) : NULL;
+        float *row = out + r * window.width;
+        for (size_t c = 0; c < window.width; c++) {
+            float x = (z[c + 1] - z[(ptrdiff_t)c - 1]) * per_x,
+                  y = (z[c + stride] - (z + c)[-(ptrdiff_t)stride]) * per_y;
+            float square = fminf(x * x + y * y, 1e30f), energy = row[c];
+            if (known && known[c] == SCENE_FILLED)
+                square += t->filled_slope2;
+            row[c] = sqrtf(per_mean * (energy * square / (square + limit * energy + 1e-30f)));
+        }
+    }
     return status;
 }

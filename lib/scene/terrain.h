@@ -1,8 +1,8 @@
-/* Detail of real terrain below a raster of cell means: fbm/terrain.h, with its numbers taken from the raster. */
+/* Detail of real terrain below a raster of cell means: fbm/relief.h, with its numbers taken from the raster. */
 #ifndef SCENE_TERRAIN_H
 #define SCENE_TERRAIN_H
 
-#include "fbm/terrain.h"
+#include "fbm/relief.h"
 #include "lib/scene/chain.h"
 #include "lib/scene/patch.h"
 #include "lib/scene/roughness.h"
@@ -10,15 +10,25 @@
 /* A raster's own numbers. All is decided once, so that every window is made alone. */
 typedef struct scene_terrain {
     double mean_energy, noise_energy; /* of the finest details; of its quantisation */
-    double steering, levelling;       /* how the detail goes with the slope: see fbm_terrain_fit */
+    double mean_amplitude;            /* mean square amplitude of octave 0 over the raster */
+    float filled_slope2;              /* square slope that filled voids are taken to have */
+    double steering, levelling;       /* how the detail goes with the slope: see fbm_relief_fit */
     scene_growth growth;
-    fbm_terrain_step steps[SCENE_LEVEL_MAX]; /* steps[l] leads from level l to level l + 1 */
+    fbm_relief_step steps[SCENE_LEVEL_MAX]; /* steps[l] leads from level l to level l + 1 */
 } scene_terrain;
 
 /* Measures a raster, and calibrates its octaves on samples of it so that they get the standard deviations asked for:
  * octaves[0 ... SCENE_LEVEL_MAX - 1], of which `levels` are used. */
 tl_status scene_terrain_measure(const tl_source *dem, const scene_detail *detail, const scene_octave *octaves,
                                 int levels, uint64_t seed, const tl_run *run, scene_terrain *out, tl_error *error);
+
+/* Only what scene_terrain_strengths needs. */
+tl_status scene_terrain_measure_strengths(const tl_source *dem, const scene_detail *detail, const scene_octave *octaves,
+                                          const tl_run *run, scene_terrain *out, tl_error *error);
+/* The strength of the detail at the samples of a window, mean square 1 over the raster: by the energy of the place,
+ * less where it is level. `patch` reaches FBM_ENERGY_MARGIN beyond it. */
+tl_status scene_terrain_strengths(const scene_terrain *terrain, const scene_patch *patch, fbm_window window, float *out,
+                                  const char *name, tl_error *error);
 
 /* Makes a window of level `level` > 0 (which may reach beyond the raster), row by row `stride` apart; samples under
  * voids are made up too. `patch`, if not NULL, gets the part of level 0 that it was made from; free it. */

@@ -2,7 +2,7 @@
  * that runs here, beside a memcpy of the same bytes. */
 #include "fbm/kernel.h"
 #include "fbm/refine.h"
-#include "fbm/terrain_kernel.h"
+#include "fbm/relief_kernel.h"
 #include "tests/bench/bench.h"
 
 #include <math.h>
@@ -60,7 +60,7 @@ static void run_chain(void *context)
 {
     chain *c = context;
     for (int l = c->first; l < LEVELS; l++)
-        fbm_refine_by(c->kernel, &c->steps[l], c->heights[l], c->windows[l], c->heights[l + 1], c->windows[l + 1],
+        fbm_refine_by(c->kernel, &c->steps[l], c->heights[l], NULL, c->windows[l], c->heights[l + 1], c->windows[l + 1],
                       c->scratch);
 }
 
@@ -96,9 +96,9 @@ enum { OCTAVES = 3 };
 
 typedef struct terrain_chain {
     const fbm_kernel *noise;
-    const fbm_terrain_kernel *kernel;
+    const fbm_relief_kernel *kernel;
     int first;
-    fbm_terrain_step step;
+    fbm_relief_step step;
     fbm_window windows[OCTAVES + 1];
     float *heights[OCTAVES + 1], *energy[OCTAVES + 1];
     float *scratch;
@@ -114,17 +114,17 @@ static void run_terrain(void *context)
 
 static void plan_terrain(terrain_chain *c, size_t side)
 {
-    c->step = (fbm_terrain_step){.children_x = 5,
-                                 .children_y = 7,
-                                 .gains = {1, 1, 1},
-                                 .steer = 1,
-                                 .steer_slope2 = .1F,
-                                 .level = 4,
-                                 .level_slope = .3F,
-                                 .limit = .01F};
+    c->step = (fbm_relief_step){.children_x = 5,
+                                .children_y = 7,
+                                .gains = {1, 1, 1},
+                                .steer = 1,
+                                .steer_slope2 = .1F,
+                                .level = 4,
+                                .level_slope = .3F,
+                                .limit = .01F};
     c->windows[OCTAVES] = (fbm_window){0, 0, side, side, side};
     for (int l = OCTAVES; l > 0; l--)
-        c->windows[l - 1] = fbm_terrain_support(c->windows[l]);
+        c->windows[l - 1] = fbm_relief_support(c->windows[l]);
     for (int l = 0; l <= OCTAVES; l++) {
         size_t count = c->windows[l].stride * c->windows[l].height;
         c->heights[l] = allocate(count, sizeof(float));
@@ -134,7 +134,7 @@ static void plan_terrain(terrain_chain *c, size_t side)
             c->energy[l][k] = 1;
         }
     }
-    c->scratch = allocate(fbm_terrain_scratch(side, side), sizeof(float));
+    c->scratch = allocate(fbm_relief_scratch(side, side), sizeof(float));
 }
 
 static void measure_terrain(size_t side)
@@ -145,7 +145,7 @@ static void measure_terrain(size_t side)
     printf("terrain, tile of %zu x %zu; memcpy of the same bytes %.3f ns a sample\n", side, side, 1e9 * copy);
     printf("  %-8s %10s %10s %14s\n", "kernel", "1 level", "3 levels", "3 levels/copy");
     const fbm_kernel *const *noise = fbm_kernels();
-    for (const fbm_terrain_kernel *const *kernel = fbm_terrain_kernels(); *kernel; kernel++, noise++) {
+    for (const fbm_relief_kernel *const *kernel = fbm_relief_kernels(); *kernel; kernel++, noise++) {
         c.kernel = *kernel;
         c.noise = *noise;
         c.first = 0;

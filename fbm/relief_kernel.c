@@ -1,7 +1,7 @@
 /* The arithmetic of terrain's detail, in plain C that compilers vectorise. Built once an instruction set, with
  * FBM_KERNEL naming the table; the results are the same bits: every operation is elementwise, in a fixed order, and
  * nothing is contracted. */
-#include "fbm/terrain_kernel.h"
+#include "fbm/relief_kernel.h"
 
 #include <assert.h>
 #include <math.h>
@@ -65,11 +65,11 @@ typedef struct planes {
     float *mean[2], *x[2], *y[2], *mixed[2]; /* NOISE: means and details of the noise and of the levelling */
     float *mean_slopes[2];                   /* D along rows of the means: PITS columns, NOISE rows */
     float *soften;                           /* PITS: 1/2 where a block's details are to be halved, else 0 */
-    float *row[20];
+    float *row[21];
 } planes;
 
-/* As fbm_terrain_scratch() counts. */
-enum { CELL_PLANES = 12, ROWS = 20 };
+/* As fbm_relief_scratch() counts. */
+enum { CELL_PLANES = 12, ROWS = 21 };
 
 static planes lay_out(const float *cells, fbm_window in, fbm_window children, float *scratch)
 {
@@ -80,8 +80,8 @@ static planes lay_out(const float *cells, fbm_window in, fbm_window children, fl
     p.child_stride = padded(2 * (p.at.width + 2 * SMOOTH));
     p.cells = cells + (size_t)(p.at.j - in.j) * in.stride + (size_t)(p.at.i - in.i);
     p.cell_stride = in.stride;
-    assert(p.at.i - in.i >= FBM_TERRAIN_MARGIN && p.at.j - in.j >= FBM_TERRAIN_MARGIN);
-    size_t plane = p.stride * (p.at.height + 2 * FBM_TERRAIN_MARGIN);
+    assert(p.at.i - in.i >= FBM_RELIEF_MARGIN && p.at.j - in.j >= FBM_RELIEF_MARGIN);
+    size_t plane = p.stride * (p.at.height + 2 * FBM_RELIEF_MARGIN);
     float **each[CELL_PLANES] = {&p.slopes, &p.mean[0],  &p.mean[1],  &p.x[0],           &p.x[1],           &p.y[0],
                                  &p.y[1],   &p.mixed[0], &p.mixed[1], &p.mean_slopes[0], &p.mean_slopes[1], &p.soften};
     for (size_t k = 0; k < CELL_PLANES; k++, scratch += plane)
@@ -148,14 +148,14 @@ static void children_rows(const float *restrict z, float *restrict x, float *res
 
 static void predict(const planes *p)
 {
-    size_t columns = p->at.width + 2 * SMOOTH, rows = p->at.height + 2 * FBM_TERRAIN_MARGIN;
+    size_t columns = p->at.width + 2 * SMOOTH, rows = p->at.height + 2 * FBM_RELIEF_MARGIN;
     for (size_t r = 0; r < rows; r++)
-        slopes_along(cell_row(p, (ptrdiff_t)r - FBM_TERRAIN_MARGIN) - SMOOTH - REACH, columns,
+        slopes_along(cell_row(p, (ptrdiff_t)r - FBM_RELIEF_MARGIN) - SMOOTH - REACH, columns,
                      p->slopes + r * p->stride);
     for (size_t r = 0; r < p->at.height + 2 * SMOOTH; r++) {
         float *upper = p->children + 2 * r * p->child_stride, *const *row = p->row;
         const float *z = cell_row(p, (ptrdiff_t)r - SMOOTH) - SMOOTH;
-        const float *s = p->slopes + (r + FBM_TERRAIN_MARGIN - SMOOTH) * p->stride;
+        const float *s = p->slopes + (r + FBM_RELIEF_MARGIN - SMOOTH) * p->stride;
         memcpy(row[0], s, columns * sizeof *s);
         slopes_across(z, (ptrdiff_t)p->cell_stride, columns, row[1]);
         slopes_across(s, (ptrdiff_t)p->stride, columns, row[2]);
@@ -204,9 +204,9 @@ static void divergence_row(const float *restrict fx, const float *restrict above
 /* ---- Noise ---- */
 
 /* Square amplitudes: energy, less where it is level, over the variance of the steered kernel. */
-static void noise_shape_row(const fbm_terrain_step *step, const float *restrict gx, const float *restrict gy,
-                            const float *restrict g2, const float *restrict energy, size_t count, float *restrict sides,
-                            float *restrict corners, float *restrict amplitude)
+static void noise_shape_row(const fbm_relief_step *step, const float *restrict gx, const float *restrict gy,
+                            const float *restrict g2, const float *restrict energy, const float *restrict slack,
+                            size_t count, float *restrict sides, float *restrict corners, float *restrict amplitude)
 {
     const float steer = step->steer, most = .95F, soft = step->steer_slope2, limit = step->limit;
     const float strength = steer < 0 ? -steer : steer, clipped = steer < 0 ? -most : most;
@@ -219,7 +219,8 @@ static void noise_shape_row(const fbm_terrain_step *step, const float *restrict 
         float variance = whole + 4 * (b * (p * p) + t * t);
         sides[k] = p;
         corners[k] = t;
-        amplitude[k] = sqrtf(energy[k] * square / ((square + limit * energy[k] + TINY) * variance));
+        float free = square + slack[k];
+        amplitude[k] = sqrtf(energy[k] * free / ((free + limit * energy[k] + TINY) * variance));
     }
 }
 
@@ -235,7 +236,7 @@ static void noise_rows(const float *restrict above, const float *restrict at, co
     }
 }
 
-static void draw_noise(const fbm_kernel *noise, const fbm_terrain_step *step, int64_t row, int64_t first, size_t count,
+static void draw_noise(const fbm_kernel *noise, const fbm_relief_step *step, int64_t row, int64_t first, size_t count,
                        float *out)
 {
     if (step->period == 0) {
@@ -294,15 +295,15 @@ static void store_details(const planes *p, int which, size_t block_row, const fl
 
 typedef struct walk {
     const fbm_kernel *noise;
-    const fbm_terrain_step *step;
-    const float *energy; /* at the first block */
+    const fbm_relief_step *step;
+    const float *energy, *slack; /* at the first block */
     size_t energy_stride;
     const planes *p;
     size_t width;       /* children of a NOISE row */
     float per_x, per_y; /* 1 / two children */
     float *white[RING]; /* from a child before the row */
     float *fx[RING], *fy[RING];
-    float *gx, *gy, *g2, *energies, *mixed, *sides, *corners, *amplitude;
+    float *gx, *gy, *g2, *energies, *slacks, *mixed, *sides, *corners, *amplitude;
     float *noisy[2], *levelled[2];
 } walk;
 
@@ -330,7 +331,9 @@ static void walk_noise(const walk *w, size_t row)
 {
     ptrdiff_t child_row = (ptrdiff_t)row - 1 - 2 * NOISE;
     child_energy(w->energy, w->energy_stride, child_row, -NOISE, w->p->columns, w->mixed, w->energies);
-    noise_shape_row(w->step, w->gx + 1, w->gy + 1, w->g2 + 1, w->energies, w->width, w->sides, w->corners,
+    if (w->slack)
+        child_energy(w->slack, w->energy_stride, child_row, -NOISE, w->p->columns, w->mixed, w->slacks);
+    noise_shape_row(w->step, w->gx + 1, w->gy + 1, w->g2 + 1, w->energies, w->slacks, w->width, w->sides, w->corners,
                     w->amplitude);
     /* white row r is that of walk row r - 1 */
     noise_rows(ring(w->white, row), ring(w->white, row + 1), ring(w->white, row + 2), w->sides, w->corners,
@@ -347,12 +350,14 @@ static void walk_levelling(const walk *w, size_t row)
 
 /* Makes the noise (unless it is NULL) and the levelling, child row by child row (row 0 is the one above the NOISE
  * planes), and keeps their details. */
-static void make_details(const fbm_kernel *noise, const fbm_terrain_step *step, const float *energy, fbm_window in,
+static void make_details(const fbm_kernel *noise, const fbm_relief_step *step, const float *energy, fbm_window in,
                          const planes *p)
 {
     walk w = {.noise = noise, .step = step, .energy_stride = in.stride, .p = p};
     if (noise)
         w.energy = energy + (size_t)(p->at.j - in.j) * in.stride + (size_t)(p->at.i - in.i);
+    if (noise && step->slack)
+        w.slack = w.energy + in.stride * in.height;
     float *const *row = p->row;
     w.width = 2 * p->columns;
     w.per_x = 1 / (2 * step->children_x);
@@ -364,7 +369,8 @@ static void make_details(const fbm_kernel *noise, const fbm_terrain_step *step, 
     }
     w.gx = row[9], w.gy = row[10], w.g2 = row[11], w.energies = row[12], w.mixed = row[13], w.sides = row[14];
     w.corners = row[15], w.amplitude = p->soften; /* not needed yet, and larger than a row */
-    w.noisy[0] = row[16], w.noisy[1] = row[17], w.levelled[0] = row[18], w.levelled[1] = row[19];
+    w.noisy[0] = row[16], w.noisy[1] = row[17], w.levelled[0] = row[18], w.levelled[1] = row[19], w.slacks = row[20];
+    memset(w.slacks, 0, w.width * sizeof *w.slacks);
     size_t rows = 2 * p->rows;
     if (noise) {
         draw_row(&w, 1);
@@ -438,7 +444,7 @@ static void finish_row(const planes *p, const float gains[3], size_t block_row, 
     const surplus f = surplus_at(p, 0, block_row + NOISE - PITS, NOISE - PITS),
                   h = surplus_at(p, 1, block_row + NOISE - PITS, NOISE - PITS);
     const float *z = cell_row(p, (ptrdiff_t)block_row - PITS) - PITS;
-    const float *s = p->slopes + (block_row + FBM_TERRAIN_MARGIN - PITS) * p->stride + SMOOTH - PITS;
+    const float *s = p->slopes + (block_row + FBM_RELIEF_MARGIN - PITS) * p->stride + SMOOTH - PITS;
     const ptrdiff_t stride = (ptrdiff_t)p->stride;
     const size_t count = p->at.width + 2 * PITS;
     float *const *row = p->row;
@@ -517,7 +523,7 @@ static void hand_out_energy(const planes *p, const float *energy, fbm_window in,
     }
 }
 
-static void refine(const fbm_kernel *noise, const fbm_terrain_step *step, const float *heights, const float *energy,
+static void refine(const fbm_kernel *noise, const fbm_relief_step *step, const float *heights, const float *energy,
                    fbm_window in, float *out, float *out_energy, fbm_window children, float *scratch)
 {
     planes p = lay_out(heights, in, children, scratch);
@@ -534,12 +540,15 @@ static void refine(const fbm_kernel *noise, const fbm_terrain_step *step, const 
         memcpy(out + r * children.stride, p.children + (y + r) * p.child_stride + x, children.width * sizeof *out);
     if (out_energy)
         hand_out_energy(&p, energy, in, children, out_energy);
+    if (out_energy && step->slack)
+        hand_out_energy(&p, energy + in.stride * in.height, in, children,
+                        out_energy + children.stride * children.height);
 }
 
 /* ---- Sums over blocks ---- */
 
-static void add_sums(const fbm_kernel *noise, const fbm_terrain_step *step, const float *heights, const float *energy,
-                     fbm_window in, fbm_window children, float *scratch, fbm_terrain_sums *sums)
+static void add_sums(const fbm_kernel *noise, const fbm_relief_step *step, const float *heights, const float *energy,
+                     fbm_window in, fbm_window children, float *scratch, fbm_relief_sums *sums)
 {
     assert(!((children.i | children.j | (int64_t)children.width | (int64_t)children.height) & 1));
     planes p = lay_out(heights, in, children, scratch);
@@ -559,7 +568,7 @@ static void add_sums(const fbm_kernel *noise, const fbm_terrain_step *step, cons
     sums->count += p.at.width * p.at.height;
 }
 
-static void add_slopes(const fbm_terrain_step *step, const float *heights, fbm_window in, fbm_window children,
+static void add_slopes(const fbm_relief_step *step, const float *heights, fbm_window in, fbm_window children,
                        float *scratch, fbm_slopes *slopes)
 {
     planes p = lay_out(heights, in, children, scratch);
@@ -582,7 +591,7 @@ static void add_slopes(const fbm_terrain_step *step, const float *heights, fbm_w
 
 /* The fit of one block: details a (of the samples) and b (of the levelling), slope of the means (gx, gy). */
 static void fit_block(const double a[3], const double b[3], double gx, double gy, const double shares[2],
-                      fbm_terrain_fit *fit)
+                      fbm_relief_fit *fit)
 {
     double g2 = gx * gx + gy * gy, x = a[0] / shares[0], y = a[1] / shares[1];
     fit->stretch += ((y * y - x * x) * (gx * gx - gy * gy) - 2 * x * y * (2 * gx * gy)) / g2;
@@ -593,8 +602,8 @@ static void fit_block(const double a[3], const double b[3], double gx, double gy
     }
 }
 
-static void add_fit(const fbm_terrain_step *step, const float *means, fbm_window in, const float *samples,
-                    fbm_window children, const double shares[2], double steep, float *scratch, fbm_terrain_fit *fit)
+static void add_fit(const fbm_relief_step *step, const float *means, fbm_window in, const float *samples,
+                    fbm_window children, const double shares[2], double steep, float *scratch, fbm_relief_fit *fit)
 {
     assert(!((children.i | children.j | (int64_t)children.width | (int64_t)children.height) & 1));
     planes p = lay_out(means, in, children, scratch);
@@ -604,7 +613,7 @@ static void add_fit(const fbm_terrain_step *step, const float *means, fbm_window
     const double per_x = 1 / (4 * (double)step->children_x), per_y = 1 / (4 * (double)step->children_y);
     for (size_t r = 0; r < p.at.height; r++) {
         const surplus h = surplus_at(&p, 1, r + NOISE, NOISE);
-        const float *z = cell_row(&p, (ptrdiff_t)r), *s = p.slopes + (r + FBM_TERRAIN_MARGIN) * p.stride + SMOOTH;
+        const float *z = cell_row(&p, (ptrdiff_t)r), *s = p.slopes + (r + FBM_RELIEF_MARGIN) * p.stride + SMOOTH;
         const float *upper = samples + 2 * r * children.stride, *lower = upper + children.stride;
         for (size_t k = 0; k < p.at.width; k++) {
             double gx = ((double)z[k + 1] - (double)z[(ptrdiff_t)k - 1]) * per_x;
@@ -708,8 +717,8 @@ static void energy(const float *heights, fbm_window in, float *out, fbm_window o
             out[r * o.stride + k] = sums[r * o.width + k] / weights[r * o.width + k]; /* 0/0 is NaN */
 }
 
-extern const fbm_terrain_kernel JOIN(fbm_terrain_kernel_, FBM_KERNEL);
-const fbm_terrain_kernel JOIN(fbm_terrain_kernel_, FBM_KERNEL) = {
+extern const fbm_relief_kernel JOIN(fbm_relief_kernel_, FBM_KERNEL);
+const fbm_relief_kernel JOIN(fbm_relief_kernel_, FBM_KERNEL) = {
     .name = TEXT(FBM_KERNEL),
     .refine = refine,
     .add_sums = add_sums,
