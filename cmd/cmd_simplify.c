@@ -17,6 +17,7 @@ typedef struct settings {
     const char *keep;
     double share; /* of the samples, by --keep; 0: none */
     const char *error_cache;
+    const char *error_map;
 } settings;
 
 static const char *const mesh_names[] = {[TL_MESH_QUADTREE] = "quadtree", [TL_MESH_TIN] = "tin", NULL};
@@ -91,7 +92,7 @@ static void report(const settings *set, const tl_source *dem, uint64_t isolated,
 /* Whether the mesh comes out of an error pyramid. */
 static bool by_pyramid(const settings *set)
 {
-    return set->triangles || set->vertices || set->share > 0 || set->error_cache;
+    return set->triangles || set->vertices || set->share > 0 || set->error_cache || set->error_map;
 }
 
 /* Whether the DEM's heights are too many to be held, which a pyramid need not do. */
@@ -146,6 +147,18 @@ static tl_status select_mesh(settings *set, const tl_source *dem, const tl_run *
                               .vertices = set->share > 0 ? (uint64_t)fmax(1, floor(samples * set->share))
                                                          : (uint64_t)set->vertices,
                               .run = run};
+    opened_input map = {0};
+    if (set->error_map) {
+        char *name = (char *)set->error_map;
+        common plain = set->common; /* the map has bounds, not heights */
+        plain.voids = plain.geoid = NULL;
+        plain.nodata_given = false, plain.band = 0;
+        map = command_open(&plain, &(arguments){.names = &name, .count = 1}, run, error);
+        if (!map.source)
+            return error->status;
+        selection.max_error_map = map.source;
+        selection.max_error = set->max_error_given ? set->max_error : -1;
+    }
     tl_pyramid *pyramid = make_pyramid(set, dem, run, error);
     tl_framework *framework = pyramid ? tl_framework_from_pyramid(pyramid, dem, &selection, error) : NULL;
     tl_status status = framework ? tl_framework_mesh(framework, mesh, error) : error->status;
@@ -155,6 +168,8 @@ static tl_status select_mesh(settings *set, const tl_source *dem, const tl_run *
     }
     tl_framework_destroy(framework);
     tl_pyramid_destroy(pyramid);
+    if (set->error_map)
+        command_close(&map);
     return status;
 }
 
@@ -220,7 +235,8 @@ static bool read_share(settings *set)
 
 static bool settings_ok(settings *set)
 {
-    int rules = set->max_error_given + (set->triangles > 0) + (set->vertices > 0) + (set->keep != NULL);
+    int rules =
+        (set->max_error_given || set->error_map) + (set->triangles > 0) + (set->vertices > 0) + (set->keep != NULL);
     if (rules == 0)
         complain("no error bound given; give --max-error E, in the DEM's unit of height, or --budget N");
     else if (rules > 1)
@@ -230,7 +246,8 @@ static bool settings_ok(settings *set)
     else if (set->skirt > 0 && set->base > 0)
         complain("--skirt and --base exclude each other: a solid has walls already");
     else if (by_pyramid(set) && (set->mesh != TL_MESH_QUADTREE || set->borders != BORDERS_FREE))
-        complain("--budget, --budget-vertices, --keep and --error-cache are for quadtree meshes with free borders; "
+        complain("--budget, --budget-vertices, --keep, --max-error-map and --error-cache are for quadtree meshes with "
+                 "free borders; "
                  "leave --mesh and --borders away");
     else
         return true;
@@ -243,6 +260,8 @@ static int run(const command *self, int argc, const char **argv, bool help)
     const option shape[] = {
         {"max-error", 'e', OPTION_NUMBER, &set.max_error, &set.max_error_given, "E",
          "largest vertical distance of any sample from the mesh, in the DEM's unit, 0...1e30 (needed)", 0, 1e30, NULL},
+        {"max-error-map", 0, OPTION_TEXT, &set.error_map, NULL, "RASTER",
+         "a bound for each sample, of as many samples as the DEM; --max-error is then that of its voids", 0, 0, NULL},
         {"budget", 0, OPTION_INTEGER, &set.triangles, NULL, "N",
          "instead of --max-error: at most N triangles, those that matter most, 1...4e9", 1, 4e9, NULL},
         {"budget-vertices", 0, OPTION_INTEGER, &set.vertices, NULL, "N", "the same for vertices", 1, 4e9, NULL},

@@ -299,6 +299,38 @@ static void force_parents(builder *self, int64_t x, int64_t y)
     }
 }
 
+static bool is_lattice_corner(const tl_framework *framework, int64_t x, int64_t y)
+{
+    return ((x | y) & ((INT64_C(1) << framework->lattice_log) - 1)) == 0;
+}
+
+/* Marks a vertex that is not yet; corners of the lattice split nothing. */
+static bool mark_vertex(tl_framework *framework, int64_t x, int64_t y)
+{
+    if (x < 0 || y < 0 || x >= framework->info.width || y >= framework->info.height ||
+        is_lattice_corner(framework, x, y) || tl_bit(framework->split, framework->words, x, y))
+        return false;
+    tl_bit_set(framework->split, framework->words, x, y);
+    return true;
+}
+
+void tl_framework_force(tl_framework *framework, int64_t x, int64_t y)
+{
+    int64_t stack[256][2]; /* each of at most 128 levels leaves one vertex behind */
+    size_t depth = 0;
+    mark_vertex(framework, x, y); /* if it is already, its parents may still be missing */
+    if (!is_lattice_corner(framework, x, y))
+        stack[depth][0] = x, stack[depth++][1] = y;
+    while (depth) {
+        depth--;
+        int64_t up[2][2];
+        tl_lattice_parents(stack[depth][0], stack[depth][1], up);
+        for (int i = 0; i < 2; i++)
+            if (mark_vertex(framework, up[i][0], up[i][1]))
+                stack[depth][0] = up[i][0], stack[depth++][1] = up[i][1];
+    }
+}
+
 static void merge_borders(builder *self)
 {
     tl_framework *framework = self->framework;
@@ -569,6 +601,7 @@ tl_framework *tl_framework_create(const tl_source_info *info, double max_error, 
     }
     framework->max_error = max_error;
     framework->threads = run ? run->threads : 0;
+    framework->memory = run ? run->memory : 0;
     if (copy_info(framework, info, error) == TL_OK && lay_out(framework, error) == TL_OK)
         return framework;
     tl_framework_destroy(framework);

@@ -29,6 +29,7 @@ struct tl_framework {
     double max_error;
     bool bends; /* the bound holds in a frame where the lattice is bent */
     unsigned threads;
+    size_t memory;   /* bytes that the mesh may take; 0: any */
     int lattice_log; /* k */
     int64_t block; /* side of the squares that are decided alone: TL_BLOCK, or the whole lattice where it is smaller */
     bool voids;    /* the raster may have void samples, or has no cells at all */
@@ -78,6 +79,9 @@ typedef struct tl_rows {
  * DEM's heights. */
 tl_status tl_framework_find_points(tl_framework *framework, const tl_rows *dem, const tl_run *run, tl_error *error);
 
+/* Marks what a bound that varies needs: `limits` has one for each sample of the pyramid's raster. */
+void tl_framework_mark_limits(tl_framework *framework, const tl_pyramid *pyramid, const float *limits);
+
 /* Number of triangles of the mesh. */
 tl_status tl_framework_count_triangles(const tl_framework *framework, size_t *count, tl_error *error);
 
@@ -96,6 +100,10 @@ bool tl_heights_round(const tl_heights *of, float magnitude, int log);
 
 /* The vertices whose triangles must be split so that (x, y) can split its own: the right angles of these. */
 void tl_lattice_parents(int64_t x, int64_t y, int64_t out[2][2]);
+
+/* Makes (x, y) split its triangles, and all vertices that it needs for that. Where a vertex does not split, its
+ * triangles keep the bound, so more splits never break it. Before tl_framework_find_points. */
+void tl_framework_force(tl_framework *framework, int64_t x, int64_t y);
 
 /* Eight bytes of 0 or 1 to as many bits, the first the lowest: the factor moves byte k by 56 - 7 k bits, so that all
  * meet in the highest byte. */

@@ -556,12 +556,24 @@ static tl_status count_all(drawing *self, const tl_run *run, size_t *count, tl_e
     return status;
 }
 
+/* Whether the mesh, beside the points themselves and the bitmaps, is within the memory that is left for it. */
+static tl_status mesh_fits(const tl_framework *framework, size_t triangles, tl_error *error)
+{
+    const tl_run run = {.memory = framework->memory};
+    double bytes = (sizeof(float) + sizeof(tl_vertex)) * (double)framework->point_count +
+                   3 * sizeof(uint32_t) * (double)triangles +
+                   2 * sizeof(uint64_t) * (double)framework->words * (double)framework->info.height;
+    return tl_run_fits(&run, bytes, framework->info.name, "its mesh, which a larger bound makes smaller,", error);
+}
+
 static tl_status draw_all(drawing *self, const tl_run *run, tl_mesh **out, tl_error *error)
 {
     const tl_framework *framework = self->framework;
     size_t sum;
     tl_status status = count_all(self, run, &sum, error);
     size_t all = sum + framework->tie_count;
+    if (status == TL_OK)
+        status = mesh_fits(framework, all, error);
     tl_mesh *mesh = status == TL_OK ? tl_mesh_create(framework->point_count, all, &framework->info, error) : NULL;
     if (!mesh)
         return status == TL_OK ? TL_ERROR_MEMORY : status;

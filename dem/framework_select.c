@@ -27,9 +27,10 @@ typedef struct selector {
     int64_t width, height;
     uint64_t *counts; /* by worker, KEYS each */
     cut at;
-    uint32_t high; /* what the upper half of keys must be, in counting the lower ones */
-    int shift;     /* of keys, to count by */
-    bool rims;     /* triangles are counted, of which a vertex on the raster's rim makes one, others two */
+    uint32_t high;       /* what the upper half of keys must be, in counting the lower ones */
+    int shift;           /* of keys, to count by */
+    const float *limits; /* by sample, where the bound varies; else NULL */
+    bool rims;           /* triangles are counted, of which a vertex on the raster's rim makes one, others two */
 } selector;
 
 static inline int size_at(int64_t x, int64_t y)
@@ -210,7 +211,10 @@ static tl_framework *mark(selector *self, double max_error, const tl_source *dem
     self->framework = framework;
     framework->voids = shape->voids;
     framework->bends = self->pyramid->bends;
-    tl_status status = tl_parallel_for(run, (uint64_t)tl_div_up(self->height, BAND), 0, mark_band, self, error);
+    uint64_t bands = (uint64_t)tl_div_up(self->height, BAND);
+    tl_status status = self->limits ? TL_OK : tl_parallel_for(run, bands, 0, mark_band, self, error);
+    if (self->limits)
+        tl_framework_mark_limits(framework, self->pyramid, self->limits);
     if (status == TL_OK && self->at.size < TL_SIZES) {
         mark_larger(self);
         mark_some(self);
@@ -267,12 +271,62 @@ static bool same_raster(const tl_pyramid *pyramid, const tl_source *dem, tl_erro
     return false;
 }
 
+/* Whether a bound that varies is one everywhere; *largest becomes the largest. Voids of the map get max_error. */
+static tl_status check_limits(float *limits, size_t count, const tl_source *map, double max_error, double *largest,
+                              tl_error *error)
+{
+    *largest = 0;
+    for (size_t k = 0; k < count; k++) {
+        double limit = isnan(limits[k]) ? max_error : (double)limits[k];
+        if (!(limit >= 0))
+            return tl_fail(error, TL_ERROR_DATA, "%s: a bound of %g; bounds must be 0 or larger", map->info.name,
+                           limit);
+        limits[k] = (float)limit;
+        if ((double)limits[k] > limit)
+            limits[k] = nextafterf(limits[k], 0);
+        *largest = fmax(*largest, limit);
+    }
+    return TL_OK;
+}
+
+static tl_framework *select_by_map(selector *self, const tl_source *dem, const tl_selection *selection, tl_error *error)
+{
+    const tl_source *map = selection->max_error_map;
+    if (map->info.width != self->width || map->info.height != self->height) {
+        tl_fail(error, TL_ERROR_ARGUMENT,
+                "%s: has %lld x %lld samples, where the model has %lld x %lld; a map of bounds needs one for each "
+                "sample",
+                map->info.name, (long long)map->info.width, (long long)map->info.height, (long long)self->width,
+                (long long)self->height);
+        return NULL;
+    }
+    double samples = (double)self->width * (double)self->height, largest = 0;
+    if (tl_run_fits(selection->run, sizeof(float) * samples, map->info.name, "the map of bounds", error) != TL_OK)
+        return NULL;
+    float *limits = tl_alloc_grid(self->width, self->height, sizeof *limits);
+    tl_status status = limits ? TL_OK : tl_fail_memory(error, "the map of bounds");
+    for (int64_t y = 0; status == TL_OK && y < self->height; y += BAND) {
+        tl_window window = {0, y, self->width, tl_int64_min(BAND, self->height - y)};
+        status = tl_source_read(map, map->info.level, window, limits + y * self->width, error);
+    }
+    if (status == TL_OK)
+        status = check_limits(limits, (size_t)self->width * (size_t)self->height, map, selection->max_error, &largest,
+                              error);
+    self->limits = limits;
+    self->at = everything_above(tl_pyramid_most(self->pyramid));
+    tl_framework *framework = status == TL_OK ? mark(self, largest, dem, selection->run, error) : NULL;
+    free(limits);
+    return framework;
+}
+
 tl_framework *tl_framework_from_pyramid(const tl_pyramid *pyramid, const tl_source *dem, const tl_selection *selection,
                                         tl_error *error)
 {
     selector self = {.pyramid = pyramid, .width = dem->info.width, .height = dem->info.height};
     if (!same_raster(pyramid, dem, error))
         return NULL;
+    if (selection->max_error_map && !selection->triangles && !selection->vertices)
+        return select_by_map(&self, dem, selection, error);
     if (selection->triangles || selection->vertices) {
         self.rims = selection->triangles;
         return select_budget(&self, selection->triangles ? selection->triangles : selection->vertices, dem,

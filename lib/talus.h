@@ -506,6 +506,9 @@ TL_API double tl_pyramid_error(const tl_pyramid *pyramid, int64_t i, int64_t j);
 /* What to take out of a pyramid: `triangles`, or `vertices`, or all that `max_error` needs. */
 typedef struct tl_selection {
     double max_error; /* the bound, >= 0 */
+    /* A bound, >= 0, for each sample of the model, where not NULL: a triangle keeps the smallest of the samples that it
+     * covers. `max_error` is that of the map's voids. Not for budgets. */
+    const tl_source *max_error_map;
     /* Where not 0: at most so many, and as many as there can be: samples are taken by falling error, those that split
      * larger triangles first where errors are equal, then row by row. Fewer than what voids and rims take alone is
      * refused. */

@@ -90,6 +90,7 @@ int main(void)
         for (uint32_t x = 0; x < SIZE; x++)
             heights[y * SIZE + x] = height_at(x, y);
     tl_source_info info = {.width = SIZE, .height = SIZE, .name = "noise"};
+    info.georef = (tl_georef){.transform = {0, 1, 0, 0, 0, -1}, .cell_x = 1, .cell_y = 1, .height_unit = 1};
     work self = {.source = tl_array_source_create(heights, &info, NULL)};
     bench_print_machine();
     for (size_t k = 0; k < sizeof bounds / sizeof *bounds; k++) {
