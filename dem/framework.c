@@ -39,6 +39,7 @@ typedef struct builder {
     double rises[TL_SIZES]; /* of triangles and their neighbours, metres in a cell; where the frame bends or rounds */
     tl_rounding rounding;
     dem_space **spaces; /* by worker, likewise */
+    const tl_features *features;
 } builder;
 
 /* ---- Progress over several loops ----------------------------------------------------------------- */
@@ -546,6 +547,8 @@ static tl_status build(builder *self, const tl_run *run, tl_error *error)
         if (framework->lattice_log > TL_BLOCK_LOG)
             status = run_top(self, &run_rest, error);
     }
+    if (status == TL_OK && !flat)
+        status = tl_features_force(self->features, framework, error);
     framework->voids = self->all.voids || flat;
     const tl_rows rows = {.all = self->heights};
     return status == TL_OK ? tl_framework_find_points(framework, &rows, &run_rest, error) : status;
@@ -618,7 +621,8 @@ tl_framework *tl_framework_build(const tl_source *dem, const tl_framework_option
                     .dem = dem,
                     .width = dem->info.width,
                     .height = dem->info.height,
-                    .rounding = options->rounding};
+                    .rounding = options->rounding,
+                    .features = options->features};
     tl_status status = build(&self, options->run, error);
     free(self.heights);
     free(self.found);

@@ -79,6 +79,9 @@ typedef struct tl_rows {
  * DEM's heights. */
 tl_status tl_framework_find_points(tl_framework *framework, const tl_rows *dem, const tl_run *run, tl_error *error);
 
+/* Forces every feature. `features` may be NULL. */
+tl_status tl_features_force(const tl_features *features, tl_framework *framework, tl_error *error);
+
 /* Marks what a bound that varies needs: `limits` has one for each sample of the pyramid's raster. */
 void tl_framework_mark_limits(tl_framework *framework, const tl_pyramid *pyramid, const float *limits);
 

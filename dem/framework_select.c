@@ -31,6 +31,7 @@ typedef struct selector {
     int shift;           /* of keys, to count by */
     const float *limits; /* by sample, where the bound varies; else NULL */
     bool rims;           /* triangles are counted, of which a vertex on the raster's rim makes one, others two */
+    const tl_features *features;
 } selector;
 
 static inline int size_at(int64_t x, int64_t y)
@@ -219,6 +220,8 @@ static tl_framework *mark(selector *self, double max_error, const tl_source *dem
         mark_larger(self);
         mark_some(self);
     }
+    if (status == TL_OK)
+        status = tl_features_force(self->features, framework, error);
     const tl_rows rows = {.source = dem};
     if (status == TL_OK)
         status = tl_framework_find_points(framework, &rows, run, error);
@@ -323,6 +326,7 @@ tl_framework *tl_framework_from_pyramid(const tl_pyramid *pyramid, const tl_sour
                                         tl_error *error)
 {
     selector self = {.pyramid = pyramid, .width = dem->info.width, .height = dem->info.height};
+    self.features = selection->features;
     if (!same_raster(pyramid, dem, error))
         return NULL;
     if (selection->max_error_map && !selection->triangles && !selection->vertices)

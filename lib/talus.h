@@ -410,6 +410,43 @@ TL_API tl_status tl_mesh_verify(const tl_mesh *mesh, const tl_source *source, co
 TL_API tl_status tl_mesh_verify_in(const tl_mesh *mesh, const tl_source *source, tl_frame frame, const tl_run *run,
                                    tl_mesh_report *out, tl_error *error);
 
+/* ---- Features ---------------------------------------------------------------------------------- */
+
+/* What a sample is; a set of these. */
+typedef enum tl_feature_kind {
+    TL_FEATURE_SUMMIT = 1, /* higher than all eight neighbours; of equal ones the last, row by row, is the highest */
+    TL_FEATURE_PIT = 2,
+    TL_FEATURE_PASS = 4,   /* where two hills, or two hollows, meet */
+    TL_FEATURE_RIDGE = 8,  /* on the steepest way up from a pass to a summit */
+    TL_FEATURE_VALLEY = 16 /* on the steepest way down from a pass to a pit */
+} tl_feature_kind;
+
+typedef struct tl_feature {
+    int32_t i, j;
+    float z;
+    unsigned kinds; /* of tl_feature_kind */
+} tl_feature;
+
+/* Features row by row. */
+typedef struct tl_features {
+    size_t count;
+    tl_feature *items;
+} tl_features;
+
+typedef struct tl_features_options {
+    /* What matters, in units of height: a summit at least so high above the highest pass that leads to a higher one, a
+     * pit likewise (topological persistence), and these passes. The highest sample and the lowest count where they are
+     * so far apart. */
+    double persistence;
+    bool lines; /* ridges and valleys too */
+    const tl_run *run;
+} tl_features_options;
+
+/* Finds the features of an elevation model, which is held in memory: 21 bytes a sample. */
+TL_API tl_status tl_features_find(const tl_source *dem, const tl_features_options *options, tl_features **out,
+                                  tl_error *error);
+TL_API void tl_features_destroy(tl_features *features);
+
 /* ---- Framework --------------------------------------------------------------------------------- */
 
 /* The characteristic points of an elevation model under a strict error bound: the restricted quadtree
@@ -431,7 +468,8 @@ typedef struct tl_framework_options {
      * ellipsoid and triangles are flat, so that a wide one sags below level ground: by 2 m if it is 10 km wide. The
      * other frames have flat lattices. */
     tl_frame frame;
-    tl_rounding rounding; /* of the file that the mesh will be written to, which counts into the bound */
+    tl_rounding rounding;        /* of the file that the mesh will be written to, which counts into the bound */
+    const tl_features *features; /* samples that become characteristic points whatever the bound; NULL: none */
 } tl_framework_options;
 
 TL_API tl_framework *tl_framework_build(const tl_source *dem, const tl_framework_options *options, tl_error *error);
@@ -513,6 +551,7 @@ typedef struct tl_selection {
      * larger triangles first where errors are equal, then row by row. Fewer than what voids and rims take alone is
      * refused. */
     uint64_t triangles, vertices;
+    const tl_features *features; /* become points too, and count into budgets; NULL: none */
     const tl_run *run;
 } tl_selection;
 
@@ -572,6 +611,109 @@ typedef struct tl_noise_options {
 
 /* A fractional Brownian surface of size x size samples at unit spacing: S(h) = delta^2 |h|^(2 hurst). */
 TL_API tl_source *tl_noise_create(const tl_noise_options *options, tl_error *error);
+
+/* ---- Statistics -------------------------------------------------------------------------------- */
+
+/* How like fractional Brownian motion a raster is: E|Z(x + h) - Z(x)|^2 = delta^2 |h|^(2 hurst), with h in samples (of
+ * cells that are not square: in sqrt(cell_x cell_y)). Errors are one standard deviation of the estimate for Gaussian
+ * fBm sampled as the raster is, computed from its covariance; real terrain, which is no single power law, has a
+ * `misfit` above 1. */
+
+enum {
+    TL_STATISTICS_LAGS = 32,
+    TL_STATISTICS_DIRECTIONS = 4, /* along rows, along columns, to the next column and row, and to the row before */
+    TL_STATISTICS_FITTED = 4,     /* lags 1, 2, 4 and 8 */
+    TL_STATISTICS_OCTAVES = 16,
+    TL_STATISTICS_WAVES = 64,
+};
+
+/* Mean squared increments over `lag` columns and rows, by direction; NaN where there are none. */
+typedef struct tl_lag {
+    int64_t lag;
+    double structure[TL_STATISTICS_DIRECTIONS]; /* Z(x + h) - Z(x), as they are: rounding included */
+    double second[TL_STATISTICS_DIRECTIONS];    /* Z(x) - 2 Z(x + h) + Z(x + 2h) */
+} tl_lag;
+
+typedef struct tl_fbm_estimate {
+    const char *name;    /* "increments" (second-order), "structure" (function, first-order) or "spectrum" */
+    const char *refusal; /* why it tells nothing; NULL: it does */
+    double hurst, hurst_error;
+    bool delta_known; /* false where hurst is 1 or more, which no fBm has */
+    double delta, delta_error;
+    double misfit; /* chi-square over its degrees of freedom; 0: not known */
+} tl_fbm_estimate;
+
+/* The detail that halving the spacing adds, octave 0 the finest: as tl_roughness, with rounding taken off. */
+typedef struct tl_octave {
+    double cells; /* spacing of the children, in samples: 2^octave */
+    double sigma; /* 0: not known */
+    double exponent; /* log2 of the next octave's sigma over this one's; NaN: not known */
+    /* The Hurst exponent of fBm with this exponent: the same for area rasters; of a point raster the finest octaves,
+     * which are means of few points, are put right. NaN: none in 0.01 ... 0.99. */
+    double hurst;
+    uint64_t count;
+} tl_octave;
+
+typedef struct tl_statistics {
+    uint64_t samples, voids;
+    double noise; /* variance of the rounding that was taken off: that of the quantum, or of floats this large */
+    size_t lag_count;
+    tl_lag lags[TL_STATISTICS_LAGS]; /* up to a quarter of the shorter side */
+    /* By second-order increments, the structure function and the spectrum. The first is the sharpest: its error for
+     * 65 x 65 samples is about 0.02. The second falls off above hurst 0.7, as all that use first-order increments. */
+    tl_fbm_estimate estimates[3];
+    double slope, slope_error;                         /* of the power spectrum in the plane, k^-slope: 2 hurst + 2 */
+    size_t wave_count;                                 /* 0: no window of 32 samples or more is without voids */
+    double waves[TL_STATISTICS_WAVES], power[TL_STATISTICS_WAVES]; /* cycles a sample; height^2, white noise is flat */
+    /* Largest over smallest standard deviation of increments by direction, the azimuth of the largest (degrees
+     * clockwise from the grid's north, 0 ... 180), and the chance of isotropic fBm to look so. 0: not known. */
+    double anisotropy, anisotropy_error, azimuth, isotropy_chance;
+    /* Largest over smallest variance of second-order increments over one sample, by their middle's column and row
+     * modulo 2, 4 and 8; stationary fBm stays below the limit with a probability of 0.99. 0: not known. */
+    double positions[3], position_limits[3];
+    /* Of second-order increments over normality_lag samples (the shortest at which rounding does not count; 0: not
+     * known): skewness and excess kurtosis, and the chance of Gaussian fBm to depart as far: reject below 0.01, and one
+     * Gaussian field in a hundred is. */
+    int64_t normality_lag;
+    double skewness, skewness_error, kurtosis, kurtosis_error, normality_chance;
+    size_t octave_count;
+    tl_octave octaves[TL_STATISTICS_OCTAVES];
+} tl_statistics;
+
+/* Measures the finest level of a source, which is read once, in parallel (and windows of it again, for the spectrum).
+ * Voids, and heights that were filled into them, are left out. Takes some 25 MB and 8 MB a worker, whatever the size.
+ */
+TL_API tl_status tl_statistics_measure(const tl_source *source, const tl_run *run, tl_statistics *out, tl_error *error);
+
+/* What a raster ought to be. */
+typedef struct tl_expectation {
+    bool hurst_given, delta_given;
+    double hurst, delta;
+    double tolerance; /* of hurst, and of delta as a fraction of it; 0: 0.05 */
+} tl_expectation;
+
+/* TL_ERROR_DATA, with the estimate by second-order increments and its error, where it is farther off or not known. */
+TL_API tl_status tl_statistics_expect(const tl_statistics *statistics, const tl_expectation *expected, const char *name,
+                                      tl_error *error);
+
+/* Local maps. */
+typedef struct tl_map_options {
+    int window; /* samples on a side, 33 ... 513; 0: 65 */
+    int stride; /* samples between windows, 8 ... 512; 0: 32 */
+    bool overwrite;
+    const tl_run *run;
+} tl_map_options;
+
+/* Writes a GeoTIFF with five bands, a cell for every `stride` samples: H by second-order increments, sigma of the finest
+ * octave, azimuth of the roughest direction, the error of H, and the number of increments that H rests on. NaN where
+ * the data do not tell. Takes 20 bytes a cell. */
+TL_API tl_status tl_statistics_write_maps(const tl_source *source, const char *path, const tl_map_options *options,
+                                          tl_error *error);
+
+/* Draws the structure functions, the spectrum and the octaves as .svg or .png. TL_ERROR_ARGUMENT where the library was
+ * built without cairo. */
+TL_API tl_status tl_statistics_plot(const tl_statistics *statistics, const char *title, const char *path, bool overwrite,
+                                    tl_error *error);
 
 /* ---- Writing ----------------------------------------------------------------------------------- */
 
