@@ -557,8 +557,8 @@ static void add_sums(const fbm_kernel *noise, const fbm_relief_step *step, const
     for (size_t r = 0; r < p.at.height; r++) {
         const surplus f = surplus_at(&p, 0, r + NOISE, NOISE), h = surplus_at(&p, 1, r + NOISE, NOISE);
         for (size_t k = 0; k < p.at.width; k++) {
-            const double a[3] = {surplus_x(&f, k), surplus_y(&f, k), surplus_mixed(&f, k)};
-            const double b[3] = {surplus_x(&h, k), surplus_y(&h, k), surplus_mixed(&h, k)};
+            const double a[3] = {(double)surplus_x(&f, k), (double)surplus_y(&f, k), (double)surplus_mixed(&f, k)};
+            const double b[3] = {(double)surplus_x(&h, k), (double)surplus_y(&h, k), (double)surplus_mixed(&h, k)};
             for (int d = 0; d < 3; d++) {
                 sums->noise[d] += a[d] * a[d];
                 sums->levelling[d] += b[d] * b[d];
@@ -624,7 +624,7 @@ static void add_fit(const fbm_relief_step *step, const float *means, fbm_window 
             haar_row(upper + 2 * k, lower + 2 * k, 1, &mean, &x, &y, &mixed);
             const double a[3] = {(double)(x - s[k]), (double)(y - slope_across(z + k, (ptrdiff_t)p.cell_stride)),
                                  (double)(mixed - slope_across(s + k, (ptrdiff_t)p.stride))};
-            const double b[3] = {surplus_x(&h, k), surplus_y(&h, k), surplus_mixed(&h, k)};
+            const double b[3] = {(double)surplus_x(&h, k), (double)surplus_y(&h, k), (double)surplus_mixed(&h, k)};
             fit_block(a, b, gx, gy, roots, fit);
         }
     }

@@ -161,23 +161,15 @@ tl_status scene_terrain_read(const scene_terrain *t, const tl_source *dem, int l
 
 /* ---- Measuring ---- */
 
-/* Windows that stand for the raster: all of it where it is small, else a grid of them. */
+/* Windows of at most `side` that stand for the raster: a grid of them, which covers it where it is small. */
 typedef struct spots {
     int64_t columns, rows, width, height;
 } spots;
 
-static spots choose_spots(const tl_source_info *dem, int64_t side)
+static spots choose_spots(int64_t width, int64_t height, int64_t side)
 {
-    spots s = {1, 1, dem->width, dem->height};
-    if (dem->width > SPOTS * side) {
-        s.columns = SPOTS;
-        s.width = side;
-    }
-    if (dem->height > SPOTS * side) {
-        s.rows = SPOTS;
-        s.height = side;
-    }
-    return s;
+    return (spots){tl_int64_min(SPOTS, tl_div_up(width, side)), tl_int64_min(SPOTS, tl_div_up(height, side)),
+                   tl_int64_min(width, side), tl_int64_min(height, side)};
 }
 
 /* The window of spot `index`, of `width` x `height` units of 1 / scale of a cell, in such units; it begins at an even
@@ -511,10 +503,7 @@ static response gather_response(const survey *s, uint64_t count)
 static tl_status calibrate_octave(survey *s, int octave, const tl_run *run, response *out, tl_error *error)
 {
     int64_t scale = INT64_C(2) << octave;
-    int64_t width = s->dem->info.width * scale, height = s->dem->info.height * scale;
-    s->spots = (spots){tl_int64_min(SPOTS, tl_div_up(width, SPOT_CHILDREN)),
-                       tl_int64_min(SPOTS, tl_div_up(height, SPOT_CHILDREN)), tl_int64_min(width, SPOT_CHILDREN),
-                       tl_int64_min(height, SPOT_CHILDREN)};
+    s->spots = choose_spots(s->dem->info.width * scale, s->dem->info.height * scale, SPOT_CHILDREN);
     s->octave = octave;
     uint64_t count = (uint64_t)(s->spots.columns * s->spots.rows);
     unsigned workers = tl_parallel_workers(run, count);
@@ -625,7 +614,7 @@ static survey begin_survey(const tl_source *dem, const scene_detail *detail, sce
     *t = (scene_terrain){.growth = {.rings = RINGS, .trend = .9f, .reflect = true}};
     t->mean_energy = fbm_detail_variance(finest, 0, detail->noise);
     t->noise_energy = (finest->x + finest->y + finest->mixed) / blocks - t->mean_energy;
-    survey s = {.terrain = t, .dem = dem, .spots = choose_spots(&dem->info, SPOT_CELLS)};
+    survey s = {.terrain = t, .dem = dem, .spots = choose_spots(dem->info.width, dem->info.height, SPOT_CELLS)};
     s.shares[0] = finest->x / blocks;
     s.shares[1] = finest->y / blocks;
     return s;
