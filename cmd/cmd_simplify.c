@@ -4,6 +4,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <strings.h>
 #include <sys/stat.h>
 #include <unistd.h>
 
@@ -18,12 +19,18 @@ typedef struct settings {
     double share; /* of the samples, by --keep; 0: none */
     const char *error_cache;
     const char *error_map;
+    bool points;
+    int features; /* index into feature_names */
 } settings;
 
 static const char *const mesh_names[] = {[TL_MESH_QUADTREE] = "quadtree", [TL_MESH_TIN] = "tin", NULL};
 
 enum { BORDERS_FREE, BORDERS_CANONICAL };
 static const char *const border_names[] = {[BORDERS_FREE] = "free", [BORDERS_CANONICAL] = "canonical", NULL};
+
+enum { FEATURES_NONE, FEATURES_POINTS, FEATURES_LINES };
+static const char *const feature_names[] = {
+    [FEATURES_NONE] = "none", [FEATURES_POINTS] = "points", [FEATURES_LINES] = "lines", NULL};
 
 static int report_check(const settings *set, const tl_mesh_report *check)
 {
@@ -120,11 +127,17 @@ static tl_pyramid *load_pyramid(const settings *set, const tl_source *dem, const
     return pyramid;
 }
 
+/* Where the bound holds: points alone have no surface but that over the lattice. */
+static tl_frame mesh_frame(const settings *set)
+{
+    return set->points ? TL_FRAME_PIXEL : (tl_frame)set->frame;
+}
+
 static tl_pyramid *make_pyramid(const settings *set, const tl_source *dem, const tl_run *run, tl_error *error)
 {
-    tl_pyramid_options options = {.frame = (tl_frame)set->frame,
-                                  .rounding = tl_write_rounding(&dem->info, set->common.output, (tl_frame)set->frame),
-                                  .run = run};
+    tl_pyramid_options options = {.frame = mesh_frame(set), .run = run};
+    if (!set->points)
+        options.rounding = tl_write_rounding(&dem->info, set->common.output, (tl_frame)set->frame);
     tl_write_options writing = {.overwrite = true, .run = run};
     tl_status status;
     tl_pyramid *pyramid = load_pyramid(set, dem, &options, &status, error);
@@ -138,14 +151,16 @@ static tl_pyramid *make_pyramid(const settings *set, const tl_source *dem, const
     return pyramid;
 }
 
-static tl_status select_mesh(settings *set, const tl_source *dem, const tl_run *run, tl_mesh **mesh, uint64_t *isolated,
-                             tl_error *error)
+/* The framework out of a pyramid. */
+static tl_framework *select_framework(const settings *set, const tl_source *dem, const tl_features *features,
+                                      const tl_run *run, tl_error *error)
 {
     double samples = (double)dem->info.width * (double)dem->info.height;
     tl_selection selection = {.max_error = set->max_error,
                               .triangles = (uint64_t)set->triangles,
                               .vertices = set->share > 0 ? (uint64_t)fmax(1, floor(samples * set->share))
                                                          : (uint64_t)set->vertices,
+                              .features = features,
                               .run = run};
     opened_input map = {0};
     if (set->error_map) {
@@ -155,29 +170,43 @@ static tl_status select_mesh(settings *set, const tl_source *dem, const tl_run *
         plain.nodata_given = false, plain.band = 0;
         map = command_open(&plain, &(arguments){.names = &name, .count = 1}, run, error);
         if (!map.source)
-            return error->status;
+            return NULL;
         selection.max_error_map = map.source;
         selection.max_error = set->max_error_given ? set->max_error : -1;
     }
     tl_pyramid *pyramid = make_pyramid(set, dem, run, error);
     tl_framework *framework = pyramid ? tl_framework_from_pyramid(pyramid, dem, &selection, error) : NULL;
-    tl_status status = framework ? tl_framework_mesh(framework, mesh, error) : error->status;
-    if (status == TL_OK) {
-        set->max_error = tl_framework_max_error(framework);
-        *isolated = tl_framework_isolated_count(framework);
-    }
-    tl_framework_destroy(framework);
     tl_pyramid_destroy(pyramid);
     if (set->error_map)
         command_close(&map);
-    return status;
+    return framework;
 }
 
-static tl_status make_mesh(settings *set, const tl_source *dem, const tl_run *run, tl_mesh **mesh, uint64_t *isolated,
-                           tl_error *error)
+static tl_framework *make_framework(settings *set, const tl_source *dem, const tl_features *features, const tl_run *run,
+                                    tl_error *error)
 {
-    if (by_pyramid(set) || too_large(set, dem, run))
-        return select_mesh(set, dem, run, mesh, isolated, error);
+    tl_framework_options options = {
+        .max_error = set->max_error, .frame = mesh_frame(set), .features = features, .run = run};
+    if (!set->points)
+        options.rounding = tl_write_rounding(&dem->info, set->common.output, (tl_frame)set->frame);
+    tl_framework *framework = by_pyramid(set) || too_large(set, dem, run)
+                                  ? select_framework(set, dem, features, run, error)
+                                  : tl_framework_build(dem, &options, error);
+    if (framework)
+        set->max_error = tl_framework_max_error(framework);
+    return framework;
+}
+
+static tl_status make_mesh(settings *set, const tl_source *dem, const tl_features *features, const tl_run *run,
+                           tl_mesh **mesh, uint64_t *isolated, tl_error *error)
+{
+    if (by_pyramid(set) || too_large(set, dem, run) || features) {
+        tl_framework *framework = make_framework(set, dem, features, run, error);
+        tl_status status = framework ? tl_framework_mesh(framework, mesh, error) : error->status;
+        *isolated = framework ? tl_framework_isolated_count(framework) : 0;
+        tl_framework_destroy(framework);
+        return status;
+    }
     tl_simplify_options options = {.max_error = set->max_error,
                                    .frame = (tl_frame)set->frame,
                                    .rounding = tl_write_rounding(&dem->info, set->common.output, (tl_frame)set->frame),
@@ -185,6 +214,93 @@ static tl_status make_mesh(settings *set, const tl_source *dem, const tl_run *ru
                                    .canonical_borders = set->borders == BORDERS_CANONICAL,
                                    .run = run};
     return tl_simplify(dem, &options, mesh, isolated, error);
+}
+
+/* ---- Features and points ---- */
+
+static void report_features(const settings *set, const tl_features *features, double samples)
+{
+    size_t counts[5] = {0};
+    for (size_t k = 0; k < features->count; k++)
+        for (int kind = 0; kind < 5; kind++)
+            counts[kind] += features->items[k].kinds >> kind & 1;
+    command_say(&set->common,
+                "features: %zu summits, %zu pits, %zu passes, %zu on ridges, %zu in valleys; %.3g %% of "
+                "the samples",
+                counts[0], counts[1], counts[2], counts[3], counts[4], 100 * (double)features->count / samples);
+}
+
+/* Finds the features that are asked for; none is good too. */
+static tl_status find_features(const settings *set, const tl_source *dem, const tl_run *run, tl_features **out,
+                               tl_error *error)
+{
+    if (set->features == FEATURES_NONE)
+        return TL_OK;
+    tl_features_options options = {.persistence = set->max_error, .lines = set->features == FEATURES_LINES, .run = run};
+    tl_status status = tl_features_find(dem, &options, out, error);
+    if (status == TL_OK)
+        report_features(set, *out, (double)dem->info.width * (double)dem->info.height);
+    return status;
+}
+
+/* Reads a written framework back, and measures its surface. */
+static int verify_points(const settings *set, const tl_source *dem, const tl_run *run, progress *bar)
+{
+    tl_error error;
+    tl_mesh *mesh = NULL;
+    tl_mesh_report check = {0};
+    progress_stage(bar, "verifying");
+    tl_framework *framework = tl_framework_load(set->common.output, run, &error);
+    int status = EXIT_DONE;
+    if (!framework || tl_framework_mesh(framework, &mesh, &error) != TL_OK ||
+        tl_mesh_verify(mesh, dem, run, &check, &error) != TL_OK)
+        status = command_failed(bar, &error);
+    progress_end(bar);
+    tl_mesh_destroy(mesh);
+    tl_framework_destroy(framework);
+    return status == EXIT_DONE ? report_check(set, &check) : status;
+}
+
+static int write_points(settings *set, const tl_source *dem, const tl_features *features, const tl_run *run,
+                        progress *bar)
+{
+    tl_error error;
+    tl_points_options options = {
+        .overwrite = set->common.overwrite, .features = features, .frame = (tl_frame)set->frame, .run = run};
+    tl_framework *framework = make_framework(set, dem, features, run, &error);
+    int status = EXIT_DONE;
+    if (!framework || tl_framework_save(framework, dem, set->common.output, &options, &error) != TL_OK)
+        status = command_failed(bar, &error);
+    double seconds = progress_end(bar), samples = (double)dem->info.width * (double)dem->info.height;
+    if (status == EXIT_DONE && set->verify && (status = verify_points(set, dem, run, bar)) != EXIT_DONE)
+        unlink(set->common.output);
+    struct stat there = {0};
+    if (status == EXIT_DONE && stat(set->common.output, &there) == 0)
+        command_say(&set->common, "%s: %zu points (%.3g %% of the samples), error <= %g, %lld bytes, %.2f s",
+                    set->common.output, tl_framework_point_count(framework),
+                    100 * (double)tl_framework_point_count(framework) / samples, set->max_error,
+                    (long long)there.st_size, seconds);
+    tl_framework_destroy(framework);
+    return status;
+}
+
+static int write_mesh(settings *set, const tl_source *dem, const tl_features *features, const tl_run *run,
+                      progress *bar)
+{
+    tl_error error;
+    tl_mesh *mesh = NULL;
+    uint64_t isolated = 0;
+    int status;
+    if (make_mesh(set, dem, features, run, &mesh, &isolated, &error) != TL_OK)
+        status = command_failed(bar, &error);
+    else {
+        double seconds = progress_end(bar);
+        status = write_and_check(set, dem, mesh, run, bar);
+        if (status == EXIT_DONE)
+            report(set, dem, isolated, mesh, seconds);
+    }
+    tl_mesh_destroy(mesh);
+    return status;
 }
 
 static int simplify(settings *set, const arguments *inputs)
@@ -202,18 +318,14 @@ static int simplify(settings *set, const arguments *inputs)
     if (!dem)
         return command_failed(&bar, &error);
     progress_stage(&bar, "simplifying");
-    tl_mesh *mesh = NULL;
-    uint64_t isolated = 0;
-    int status = EXIT_DONE;
-    if (make_mesh(set, dem, &run, &mesh, &isolated, &error) != TL_OK)
+    tl_features *features = NULL;
+    int status;
+    if (find_features(set, dem, &run, &features, &error) != TL_OK)
         status = command_failed(&bar, &error);
-    else {
-        double seconds = progress_end(&bar);
-        status = write_and_check(set, dem, mesh, &run, &bar);
-        if (status == EXIT_DONE)
-            report(set, dem, isolated, mesh, seconds);
-    }
-    tl_mesh_destroy(mesh);
+    else
+        status =
+            set->points ? write_points(set, dem, features, &run, &bar) : write_mesh(set, dem, features, &run, &bar);
+    tl_features_destroy(features);
     command_close(&opened);
     return status;
 }
@@ -233,6 +345,24 @@ static bool read_share(settings *set)
     return false;
 }
 
+static bool is_tiff(const char *path)
+{
+    const char *dot = path ? strrchr(path, '.') : NULL;
+    return dot && (strcasecmp(dot, ".tif") == 0 || strcasecmp(dot, ".tiff") == 0);
+}
+
+static bool points_output_ok(const settings *set)
+{
+    static const char *const endings[] = {".geojson", ".json", ".csv", ".ply", ".tif", ".tiff"};
+    const char *dot = set->common.output ? strrchr(set->common.output, '.') : NULL;
+    for (size_t k = 0; dot && k < sizeof endings / sizeof *endings; k++)
+        if (strcasecmp(dot, endings[k]) == 0)
+            return true;
+    complain("%s; points are written to .geojson, .csv, .ply or .tif",
+             set->common.output ? set->common.output : "no output named; give -o FILE");
+    return false;
+}
+
 static bool settings_ok(settings *set)
 {
     int rules =
@@ -249,6 +379,14 @@ static bool settings_ok(settings *set)
         complain("--budget, --budget-vertices, --keep, --max-error-map and --error-cache are for quadtree meshes with "
                  "free borders; "
                  "leave --mesh and --borders away");
+    else if ((set->points || set->features) && (set->mesh != TL_MESH_QUADTREE || set->borders != BORDERS_FREE))
+        complain("--points and --features are for quadtree meshes with free borders; leave --mesh and --borders away");
+    else if (set->features && !set->max_error_given)
+        complain("--features needs --max-error E, which tells what matters");
+    else if (set->points && (set->skirt > 0 || set->base > 0))
+        complain("--points have no --skirt and no --base");
+    else if (set->points && set->verify && !is_tiff(set->common.output))
+        complain("--verify measures a surface; of --points only .tif has one");
     else
         return true;
     return false;
@@ -273,6 +411,12 @@ static int run(const command *self, int argc, const char **argv, bool help)
          "canonical: by the rim's samples alone, so that tiles that share them join without a crack; a tin always has "
          "these (default: free)",
          0, 0, border_names},
+        {"points", 0, OPTION_FLAG, &set.points, NULL, NULL,
+         "write the points alone: .geojson, .csv, .ply, or .tif, which synth takes in place of the DEM", 0, 0, NULL},
+        {"features", 0, OPTION_CHOICE, &set.features, NULL, "KIND",
+         "keep summits, pits and passes of at least the bound's height or depth (points), and ridges and valleys "
+         "(lines; default: none)",
+         0, 0, feature_names},
         {"skirt", 0, OPTION_NUMBER, &set.skirt, NULL, "DEPTH",
          "hang walls this deep below the rim and the rims of voids, in the DEM's unit, 1e-6...1e30", 1e-6, 1e30, NULL},
         {"base", 0, OPTION_NUMBER, &set.base, NULL, "THICKNESS",
@@ -294,7 +438,8 @@ static int run(const command *self, int argc, const char **argv, bool help)
     int status;
     if (!command_begin(self, argc, argv, help, groups, -1, &rest, &status))
         return status;
-    bool good = settings_ok(&set) && command_output_ok(&set.common, false, true);
+    bool good =
+        settings_ok(&set) && (set.points ? points_output_ok(&set) : command_output_ok(&set.common, false, true));
     status = good ? simplify(&set, &rest) : EXIT_USAGE;
     arguments_free(&rest);
     return status;

@@ -42,6 +42,8 @@ struct tl_framework {
     size_t point_count, isolated_count;
     tl_tie *ties;
     size_t tie_count;
+    /* Of one that came out of a file: what fills it between its points; else 0. */
+    double hurst, delta;
 };
 
 static inline bool tl_bit(const uint64_t *bits, size_t words, int64_t x, int64_t y)
@@ -84,6 +86,9 @@ tl_status tl_features_force(const tl_features *features, tl_framework *framework
 
 /* Marks what a bound that varies needs: `limits` has one for each sample of the pyramid's raster. */
 void tl_framework_mark_limits(tl_framework *framework, const tl_pyramid *pyramid, const float *limits);
+
+/* Heights of the points among samples x ... x + count - 1 of row y; NaN for the others. */
+void tl_framework_heights(const tl_framework *framework, int64_t x, int64_t y, int64_t count, float *out);
 
 /* Number of triangles of the mesh. */
 tl_status tl_framework_count_triangles(const tl_framework *framework, size_t *count, tl_error *error);

@@ -373,6 +373,16 @@ static uint32_t rank_at(const tl_framework *framework, int64_t x, int64_t y)
     return rank + (unsigned)__builtin_popcountll(row[x >> 6] & ((UINT64_C(1) << (x & 63)) - 1));
 }
 
+void tl_framework_heights(const tl_framework *framework, int64_t x, int64_t y, int64_t count, float *out)
+{
+    uint32_t rank = rank_at(framework, x, y);
+    for (int64_t i = 0; i < count; i++) {
+        bool point = tl_bit(framework->points, framework->words, x + i, y);
+        out[i] = point ? framework->heights[rank] : NAN;
+        rank += point;
+    }
+}
+
 static void unpack(const tl_framework *framework, corner origin, unpacked *out)
 {
     int64_t size = framework->block + 1;

@@ -645,8 +645,8 @@ typedef struct tl_fbm_estimate {
 
 /* The detail that halving the spacing adds, octave 0 the finest: as tl_roughness, with rounding taken off. */
 typedef struct tl_octave {
-    double cells; /* spacing of the children, in samples: 2^octave */
-    double sigma; /* 0: not known */
+    double cells;    /* spacing of the children, in samples: 2^octave */
+    double sigma;    /* 0: not known */
     double exponent; /* log2 of the next octave's sigma over this one's; NaN: not known */
     /* The Hurst exponent of fBm with this exponent: the same for area rasters; of a point raster the finest octaves,
      * which are means of few points, are put right. NaN: none in 0.01 ... 0.99. */
@@ -662,8 +662,8 @@ typedef struct tl_statistics {
     /* By second-order increments, the structure function and the spectrum. The first is the sharpest: its error for
      * 65 x 65 samples is about 0.02. The second falls off above hurst 0.7, as all that use first-order increments. */
     tl_fbm_estimate estimates[3];
-    double slope, slope_error;                         /* of the power spectrum in the plane, k^-slope: 2 hurst + 2 */
-    size_t wave_count;                                 /* 0: no window of 32 samples or more is without voids */
+    double slope, slope_error; /* of the power spectrum in the plane, k^-slope: 2 hurst + 2 */
+    size_t wave_count;         /* 0: no window of 32 samples or more is without voids */
     double waves[TL_STATISTICS_WAVES], power[TL_STATISTICS_WAVES]; /* cycles a sample; height^2, white noise is flat */
     /* Largest over smallest standard deviation of increments by direction, the azimuth of the largest (degrees
      * clockwise from the grid's north, 0 ... 180), and the chance of isotropic fBm to look so. 0: not known. */
@@ -704,16 +704,16 @@ typedef struct tl_map_options {
     const tl_run *run;
 } tl_map_options;
 
-/* Writes a GeoTIFF with five bands, a cell for every `stride` samples: H by second-order increments, sigma of the finest
- * octave, azimuth of the roughest direction, the error of H, and the number of increments that H rests on. NaN where
- * the data do not tell. Takes 20 bytes a cell. */
+/* Writes a GeoTIFF with five bands, a cell for every `stride` samples: H by second-order increments, sigma of the
+ * finest octave, azimuth of the roughest direction, the error of H, and the number of increments that H rests on. NaN
+ * where the data do not tell. Takes 20 bytes a cell. */
 TL_API tl_status tl_statistics_write_maps(const tl_source *source, const char *path, const tl_map_options *options,
                                           tl_error *error);
 
 /* Draws the structure functions, the spectrum and the octaves as .svg or .png. TL_ERROR_ARGUMENT where the library was
  * built without cairo. */
-TL_API tl_status tl_statistics_plot(const tl_statistics *statistics, const char *title, const char *path, bool overwrite,
-                                    tl_error *error);
+TL_API tl_status tl_statistics_plot(const tl_statistics *statistics, const char *title, const char *path,
+                                    bool overwrite, tl_error *error);
 
 /* ---- Writing ----------------------------------------------------------------------------------- */
 
@@ -771,6 +771,27 @@ TL_API tl_status tl_pyramid_save(const tl_pyramid *pyramid, const char *path, co
  * or by another version: then make it again; TL_ERROR_ARGUMENT where it is no pyramid at all. */
 TL_API tl_pyramid *tl_pyramid_load(const char *path, const tl_source *dem, const tl_pyramid_options *options,
                                    tl_error *error);
+
+typedef struct tl_points_options {
+    bool overwrite;
+    const tl_features *features; /* whose kinds are told beside the points, in CSV and GeoJSON; NULL: none */
+    /* GeoJSON: longitude and latitude on the CRS's own datum and metres of height, as RFC 7946 wants (WGS 84 and what
+     * is within metres of it), or by name TL_FRAME_PROJECTED or TL_FRAME_PIXEL. PLY: as for meshes. CSV has columns,
+     * rows, CRS coordinates and heights whatever this says. */
+    tl_frame frame;
+    const tl_run *run;
+} tl_points_options;
+
+/* Writes the characteristic points: .geojson, .csv, .ply, or .tif, the sparse framework: a GeoTIFF of the model's
+ * lattice with three bands, void where no point is kept: height, Hurst exponent and the standard deviation of the
+ * height difference over one sample, both of the whole model. Where the model is void the second band is 0. `dem` is
+ * the model of the framework, read once for the .tif. */
+TL_API tl_status tl_framework_save(const tl_framework *framework, const tl_source *dem, const char *path,
+                                   const tl_points_options *options, tl_error *error);
+/* Whether a file is a framework that tl_framework_save wrote. */
+TL_API bool tl_framework_is_file(const char *path);
+/* Reads the framework back: the same points, triangles and bound. TL_ERROR_ARGUMENT where it is none. */
+TL_API tl_framework *tl_framework_load(const char *path, const tl_run *run, tl_error *error);
 
 /* ---- Pictures ---------------------------------------------------------------------------------- */
 

@@ -97,38 +97,39 @@ tl_status tl_pyramid_save(const tl_pyramid *pyramid, const char *path, const tl_
 
 /* ---- Loading ---- */
 
-static tl_status find_label(dem_tiff_file *file, char label[LABEL_LIMIT], tl_error *error)
+static bool find_item(dem_tiff_file *file, const char *name, char *text, size_t limit)
 {
-    static const char start[] = "<Item name=\"talus_" ITEM "\">", end[] = "</Item>";
+    char start[80];
     dem_tiff_handle *handle;
-    tl_status status = dem_tiff_take(file, 0, &handle, error);
-    if (status != TL_OK)
-        return status;
+    if (dem_tiff_take(file, 0, &handle, NULL) != TL_OK)
+        return false;
+    snprintf(start, sizeof start, "<Item name=\"talus_%.40s\">", name);
     char *metadata = dem_tiff_text(handle->tiff, GDAL_METADATA);
     dem_tiff_give_back(file, handle);
     const char *from = metadata ? strstr(metadata, start) : NULL;
-    const char *to = from ? strstr(from += sizeof start - 1, end) : NULL;
-    if (to && to - from < LABEL_LIMIT)
-        snprintf(label, LABEL_LIMIT, "%.*s", (int)(to - from), from);
-    else
-        status = tl_fail(error, TL_ERROR_ARGUMENT, "%s: not an error pyramid of talus; name another file",
-                         dem_tiff_file_path(file));
+    const char *to = from ? strstr(from += strlen(start), "</Item>") : NULL;
+    bool found = to && (size_t)(to - from) < limit;
+    if (found)
+        snprintf(text, limit, "%.*s", (int)(to - from), from);
     free(metadata);
-    return status;
+    return found;
+}
+
+bool out_geotiff_item(const char *path, const char *name, char *text, size_t limit)
+{
+    dem_file *file = dem_file_open(path, NULL, NULL);
+    dem_tiff_file *tiff = file ? dem_tiff_file_create(file, NULL) : NULL;
+    bool found = tiff && find_item(tiff, name, text, limit);
+    dem_tiff_file_destroy(tiff);
+    dem_file_close(file);
+    return found;
 }
 
 static tl_status read_label(const char *path, char label[LABEL_LIMIT], tl_error *error)
 {
-    dem_file *file = dem_file_open(path, NULL, error);
-    dem_tiff_file *tiff = file ? dem_tiff_file_create(file, error) : NULL;
-    tl_status status = TL_ERROR_IO;
-    if (tiff && find_label(tiff, label, error) == TL_OK)
-        status = TL_OK;
-    else if (tiff)
-        status = tl_fail(error, TL_ERROR_ARGUMENT, "%s: not an error pyramid of talus; name another file", path);
-    dem_tiff_file_destroy(tiff);
-    dem_file_close(file);
-    return status;
+    if (out_geotiff_item(path, ITEM, label, LABEL_LIMIT))
+        return TL_OK;
+    return tl_fail(error, TL_ERROR_ARGUMENT, "%s: not an error pyramid of talus; name another file", path);
 }
 
 static bool take_rows(tl_pyramid *to, int64_t y, int64_t rows, const float *values)

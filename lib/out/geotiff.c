@@ -244,18 +244,25 @@ static bool set_sample_format(TIFF *tiff, bool validity)
            TIFFSetField(tiff, TIFFTAG_SAMPLEFORMAT, validity ? SAMPLEFORMAT_UINT : SAMPLEFORMAT_IEEEFP) == 1;
 }
 
-static bool set_directory(TIFF *tiff, const tl_source_info *info, bool compress, bool validity)
+static bool set_bands(TIFF *tiff, size_t bands)
+{
+    uint16_t other[OUT_BANDS] = {EXTRASAMPLE_UNSPECIFIED};
+    bool good = TIFFSetField(tiff, TIFFTAG_SAMPLESPERPIXEL, (int)bands) == 1 &&
+                TIFFSetField(tiff, TIFFTAG_PLANARCONFIG, bands > 1 ? PLANARCONFIG_SEPARATE : PLANARCONFIG_CONTIG) == 1;
+    return good && (bands == 1 || TIFFSetField(tiff, TIFFTAG_EXTRASAMPLES, (int)bands - 1, other) == 1);
+}
+
+static bool set_directory(TIFF *tiff, const tl_source_info *info, bool compress, bool validity, size_t bands)
 {
     define_gdal_tags(tiff);
     bool good = TIFFSetField(tiff, TIFFTAG_IMAGEWIDTH, (uint32_t)info->width) == 1 &&
                 TIFFSetField(tiff, TIFFTAG_IMAGELENGTH, (uint32_t)info->height) == 1 &&
                 TIFFSetField(tiff, TIFFTAG_TILEWIDTH, OUT_TILE) == 1 &&
-                TIFFSetField(tiff, TIFFTAG_TILELENGTH, OUT_TILE) == 1 &&
-                TIFFSetField(tiff, TIFFTAG_SAMPLESPERPIXEL, 1) == 1 && set_sample_format(tiff, validity) &&
-                TIFFSetField(tiff, TIFFTAG_PLANARCONFIG, PLANARCONFIG_CONTIG) == 1 &&
+                TIFFSetField(tiff, TIFFTAG_TILELENGTH, OUT_TILE) == 1 && set_bands(tiff, bands) &&
+                set_sample_format(tiff, validity) &&
                 TIFFSetField(tiff, TIFFTAG_PHOTOMETRIC, PHOTOMETRIC_MINISBLACK) == 1 &&
                 TIFFSetField(tiff, TIFFTAG_COMPRESSION, compress ? COMPRESSION_ADOBE_DEFLATE : COMPRESSION_NONE) == 1;
-    if (good && compress && !validity)
+    if (good && compress && !validity && bands == 1)
         good = TIFFSetField(tiff, TIFFTAG_PREDICTOR, PREDICTOR_FLOATINGPOINT) == 1;
     if (good && info->has_voids && !validity)
         good = TIFFSetField(tiff, GDAL_NODATA, "nan") == 1;
@@ -304,7 +311,8 @@ typedef struct worker {
 } worker;
 
 typedef struct writing {
-    const tl_source *source;
+    const tl_source *const *bands;
+    size_t band_count; /* more than one: mostly void, so that empty tiles are left out and heights are not predicted */
     const char *path;
     TIFF *tiff;
     out_tiling tiling;
@@ -332,11 +340,11 @@ static void worker_finish(worker *self)
         libdeflate_free_compressor(self->compressor);
 }
 
-static tl_status read_tile(const writing *w, worker *self, tl_window window, tl_error *error)
+static tl_status read_tile(const writing *w, worker *self, const tl_source *source, tl_window window, tl_error *error)
 {
-    int level = w->source->info.level;
-    tl_status status = w->validity ? tl_source_validity(w->source, level, window, self->samples, error)
-                                   : tl_source_read(w->source, level, window, self->samples, error);
+    int level = source->info.level;
+    tl_status status = w->validity ? tl_source_validity(source, level, window, self->samples, error)
+                                   : tl_source_read(source, level, window, self->samples, error);
     if (status == TL_OK)
         pad_tile(self->samples, w->validity ? 1 : sizeof(float), window);
     return status;
@@ -349,7 +357,7 @@ static const void *pack_tile(const writing *w, worker *self, size_t *count)
     *count = w->validity ? OUT_TILE * OUT_TILE : TILE_BYTES;
     if (!w->compress)
         return bytes;
-    if (!w->validity) {
+    if (!w->validity && w->band_count == 1) {
         predict_rows(self->samples, self->predicted);
         bytes = self->predicted;
     }
@@ -357,19 +365,29 @@ static const void *pack_tile(const writing *w, worker *self, size_t *count)
     return self->packed;
 }
 
+static bool is_empty(const float *heights)
+{
+    size_t at = 0;
+    while (at < OUT_TILE * OUT_TILE && isnan(heights[at]))
+        at++;
+    return at == OUT_TILE * OUT_TILE;
+}
+
 static tl_status write_tile(void *context, tl_parallel *loop, uint64_t tile, unsigned index, tl_error *error)
 {
     writing *w = context;
     worker *self = &w->workers[index];
-    tl_status status = read_tile(w, self, out_tile_window(&w->tiling, tile), error);
+    uint64_t tiles = (uint64_t)w->tiling.columns * (uint64_t)w->tiling.rows;
+    tl_status status = read_tile(w, self, w->bands[tile / tiles], out_tile_window(&w->tiling, tile % tiles), error);
     if (status != TL_OK)
         return status;
     size_t count;
+    bool left_out = w->band_count > 1 && is_empty(self->samples);
     const void *bytes = pack_tile(w, self, &count);
     if (!tl_parallel_wait_turn(loop, tile))
         return tl_fail(error, TL_ERROR_CANCELLED, "interrupted");
     errno = 0;
-    if (TIFFWriteRawTile(w->tiff, (uint32_t)tile, (void *)bytes, (tmsize_t)count) != (tmsize_t)count)
+    if (!left_out && TIFFWriteRawTile(w->tiff, (uint32_t)tile, (void *)bytes, (tmsize_t)count) != (tmsize_t)count)
         return tiff_failed(w->path, &w->said, error);
     tl_parallel_end_turn(loop, tile);
     return TL_OK;
@@ -377,7 +395,7 @@ static tl_status write_tile(void *context, tl_parallel *loop, uint64_t tile, uns
 
 static tl_status write_tiles(writing *w, const tl_run *run, tl_error *error)
 {
-    uint64_t tiles = (uint64_t)w->tiling.columns * (uint64_t)w->tiling.rows;
+    uint64_t tiles = w->band_count * (uint64_t)w->tiling.columns * (uint64_t)w->tiling.rows;
     unsigned count = tl_parallel_workers(run, tiles);
     tl_status status = TL_OK;
     w->workers = calloc(count, sizeof *w->workers);
@@ -413,12 +431,15 @@ static TIFF *open_tiff(tl_output *output, bool big, complaint *said)
     return tiff;
 }
 
-static tl_status write_geotiff(const tl_source *source, bool validity, tl_output *output,
+static tl_status write_geotiff(const tl_source *const *bands, size_t band_count, bool validity, tl_output *output,
                                const tl_write_options *options, tl_error *error)
 {
-    const tl_source_info *info = &source->info;
-    writing w = {
-        .source = source, .validity = validity, .path = tl_output_path(output), .tiling = out_tiling_of(source)};
+    const tl_source_info *info = &bands[0]->info;
+    writing w = {.bands = bands,
+                 .band_count = band_count,
+                 .validity = validity,
+                 .path = tl_output_path(output),
+                 .tiling = out_tiling_of(bands[0])};
     int64_t samples;
     if (info->width > INT32_MAX || info->height > INT32_MAX || !tl_int64_mul(info->width, info->height, &samples) ||
         w.tiling.columns * w.tiling.rows > INT32_MAX)
@@ -428,12 +449,13 @@ static tl_status write_geotiff(const tl_source *source, bool validity, tl_output
     w.compress = options->compression != TL_COMPRESSION_NONE;
     w.packed_limit = libdeflate_zlib_compress_bound(NULL, TILE_BYTES);
     XTIFFInitialize();
-    w.tiff = open_tiff(output, (uint64_t)samples * sizeof(float) > classic_limit, &w.said);
+    w.tiff = open_tiff(output, band_count * (uint64_t)samples * sizeof(float) > classic_limit, &w.said);
     if (!w.tiff)
         return tiff_failed(w.path, &w.said, error);
     errno = 0;
-    tl_status status = set_directory(w.tiff, info, w.compress, validity) ? write_tiles(&w, options->run, error)
-                                                                         : tiff_failed(w.path, &w.said, error);
+    tl_status status = set_directory(w.tiff, info, w.compress, validity, band_count)
+                           ? write_tiles(&w, options->run, error)
+                           : tiff_failed(w.path, &w.said, error);
     /* TIFFClose cannot fail, so what it would do is done here */
     errno = 0;
     if (status == TL_OK && (!TIFFWriteDirectory(w.tiff) || w.said.made))
@@ -450,11 +472,17 @@ tl_status out_geotiff_write(const tl_source *source, tl_output *output, const tl
     if (options->compression == TL_COMPRESSION_PIZ || options->compression == TL_COMPRESSION_ZIPS)
         return tl_fail(error, TL_ERROR_ARGUMENT, "%s: piz and zips are compressions of EXR; use zip or none",
                        tl_output_path(output));
-    return write_geotiff(source, false, output, options, error);
+    return write_geotiff(&source, 1, false, output, options, error);
 }
 
 tl_status out_validity_write(const tl_source *source, tl_output *output, const tl_write_options *options,
                              tl_error *error)
 {
-    return write_geotiff(source, true, output, options, error);
+    return write_geotiff(&source, 1, true, output, options, error);
+}
+
+tl_status out_geotiff_write_bands(const tl_source *const *bands, size_t count, tl_output *output,
+                                  const tl_write_options *options, tl_error *error)
+{
+    return write_geotiff(bands, count, false, output, options, error);
 }

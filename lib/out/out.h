@@ -6,6 +6,7 @@
 #include "lib/talus.h"
 
 enum { OUT_TILE = 256 }; /* samples on a side of the tiles in which grids are pulled and stored */
+enum { OUT_BANDS = 4 };  /* at most, of out_geotiff_write_bands */
 
 /* Writers of one format each. They write into an open output and leave committing and aborting to the caller. */
 tl_status out_exr_write(const tl_source *source, tl_output *output, const tl_write_options *options, tl_error *error);
@@ -14,6 +15,12 @@ tl_status out_geotiff_write(const tl_source *source, tl_output *output, const tl
 /* The validity of a source's samples as a GeoTIFF of bytes. */
 tl_status out_validity_write(const tl_source *source, tl_output *output, const tl_write_options *options,
                              tl_error *error);
+/* Several sources over the same lattice, 2 ... OUT_BANDS of them and mostly void, as bands of a GeoTIFF: tiles that are
+ * void are left out. Its record is that of the first. */
+tl_status out_geotiff_write_bands(const tl_source *const *bands, size_t count, tl_output *output,
+                                  const tl_write_options *options, tl_error *error);
+/* The item talus_NAME of the record in a GeoTIFF, cut at `limit` bytes; false where there is none. */
+bool out_geotiff_item(const char *path, const char *name, char *text, size_t limit);
 tl_status out_gltf_write(const tl_mesh *mesh, tl_output *output, const tl_write_options *options, tl_error *error);
 tl_status out_obj_write(const tl_mesh *mesh, tl_output *output, const tl_write_options *options, tl_error *error);
 tl_status out_ply_write(const tl_mesh *mesh, tl_output *output, const tl_write_options *options, tl_error *error);
