@@ -29,6 +29,7 @@ typedef struct fbm_relief_step {
     float level, level_slope;     /* levelling: level * div((g - level_slope) grad z / g); level: square length */
     float limit;                  /* square amplitude E q / (q + limit E), q = g^2 + slack */
     bool slack;                   /* a plane of slacks (0 where it is not level in truth) follows that of energies */
+    bool pits;                    /* leave pits as they are */
     uint64_t seed;
     int32_t octave; /* of the input: a key of the noise, nothing else */
     int64_t period; /* columns of the input after which the noise comes again; 0: never */

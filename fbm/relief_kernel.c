@@ -533,8 +533,10 @@ static void refine(const fbm_kernel *noise, const fbm_relief_step *step, const f
         float *upper = p.children + 2 * r * p.child_stride;
         finish_row(&p, step->gains, r, upper, upper + p.child_stride);
     }
-    soften_pits(&p, 1);
-    soften_pits(&p, 0);
+    if (!step->pits) {
+        soften_pits(&p, 1);
+        soften_pits(&p, 0);
+    }
     size_t x = 2 * PITS + (size_t)(children.i - 2 * p.at.i), y = 2 * PITS + (size_t)(children.j - 2 * p.at.j);
     for (size_t r = 0; r < children.height; r++)
         memcpy(out + r * children.stride, p.children + (y + r) * p.child_stride + x, children.width * sizeof *out);

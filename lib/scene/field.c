@@ -335,7 +335,7 @@ static tl_status prepare(field *f, const tl_field_options *o, tl_error *error)
         f->chain.mapped = f->dem->info.type == TL_RASTER_POINT; /* its samples stay: the lattice is refined */
         status = f->chain.mapped
                      ? scene_terrain_measure_strengths(f->dem, &detail, octaves, o->run, f->terrain, error)
-                     : scene_terrain_measure(f->dem, &detail, octaves, o->levels, o->seed, o->run, f->terrain, error);
+                     : scene_terrain_measure(f->dem, &detail, octaves, o->levels, o->seed, 0, o->run, f->terrain, error);
     }
     return status == TL_OK ? note_all(f, o, &measured, error) : status;
 }

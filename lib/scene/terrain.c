@@ -28,7 +28,9 @@ static void normalise_energy(const scene_terrain *t, float *energy, size_t count
     const float per = t->mean_energy > 0 ? (float)(1 / t->mean_energy) : 0, noise = (float)t->noise_energy;
     for (size_t k = 0; k < count; k++) {
         float share = (energy[k] - noise) * per;
-        energy[k] = isnan(energy[k]) || per == 0 ? 1 : share > (float)FLOOR ? share : (float)FLOOR;
+        energy[k] = isnan(energy[k]) || per == 0 || t->without & SCENE_TERRAIN_PLACE ? 1
+                    : share > (float)FLOOR                                           ? share
+                                                                                     : (float)FLOOR;
     }
 }
 
@@ -550,16 +552,20 @@ static void set_geometry(scene_terrain *t, const tl_source *dem, const scene_oct
 {
     const tl_georef *g = &dem->info.georef;
     double x = g->cell_x / g->height_unit, y = g->cell_y / g->height_unit, fading = 1;
+    const double steering = t->without & SCENE_TERRAIN_STEER ? 0 : t->steering;
+    const double levelling = t->without & SCENE_TERRAIN_SLOPES ? 0 : t->levelling;
+    const double limit = t->without & SCENE_TERRAIN_LEVEL ? 0 : 16;
     for (int l = 0; l < levels; l++, x /= 2, y /= 2, fading *= .85) {
         fbm_relief_step *step = &t->steps[l];
         *step = (fbm_relief_step){.children_x = (float)(x / 2),
                                   .children_y = (float)(y / 2),
-                                  .steer = (float)(4 * t->steering * fading),
-                                  .level = (float)(x * y / 5 * t->levelling * fading),
-                                  .limit = (float)(16 * octaves[l].sigma * octaves[l].sigma / (x * y)),
+                                  .steer = (float)(4 * steering * fading),
+                                  .level = (float)(x * y / 5 * levelling * fading),
+                                  .limit = (float)(limit * octaves[l].sigma * octaves[l].sigma / (x * y)),
                                   .seed = seed,
                                   .octave = l,
                                   .slack = dem->validity != NULL,
+                                  .pits = (t->without & SCENE_TERRAIN_PITS) != 0,
                                   .period = dem->info.wraps ? dem->info.width << l : 0};
     }
 }
@@ -621,9 +627,11 @@ static survey begin_survey(const tl_source *dem, const scene_detail *detail, sce
 }
 
 tl_status scene_terrain_measure(const tl_source *dem, const scene_detail *detail, const scene_octave *octaves,
-                                int levels, uint64_t seed, const tl_run *run, scene_terrain *out, tl_error *error)
+                                int levels, uint64_t seed, unsigned without, const tl_run *run, scene_terrain *out,
+                                tl_error *error)
 {
     survey s = begin_survey(dem, detail, out);
+    out->without = without;
     set_geometry(out, dem, octaves, levels > CALIBRATED ? levels : CALIBRATED, seed);
     tl_run quiet = run ? *run : (tl_run){0};
     quiet.progress = NULL; /* the reading before took the time */

@@ -7,20 +7,31 @@
 #include "lib/scene/patch.h"
 #include "lib/scene/roughness.h"
 
+/* Parts of the rule, to be left out where their worth is measured. */
+typedef enum scene_terrain_part {
+    SCENE_TERRAIN_PLACE = 1,  /* strength by the energy of the place */
+    SCENE_TERRAIN_LEVEL = 2,  /* less strength where it is level */
+    SCENE_TERRAIN_STEER = 4,  /* noise down the slope */
+    SCENE_TERRAIN_SLOPES = 8, /* levelling of steep slopes */
+    SCENE_TERRAIN_PITS = 16,  /* softening of pits */
+} scene_terrain_part;
+
 /* A raster's own numbers. All is decided once, so that every window is made alone. */
 typedef struct scene_terrain {
     double mean_energy, noise_energy; /* of the finest details; of its quantisation */
     double mean_amplitude;            /* mean square amplitude of octave 0 over the raster */
     float filled_slope2;              /* square slope that filled voids are taken to have */
     double steering, levelling;       /* how the detail goes with the slope: see fbm_relief_fit */
+    unsigned without;                 /* parts that are left out: an or of scene_terrain_part */
     scene_growth growth;
     fbm_relief_step steps[SCENE_LEVEL_MAX]; /* steps[l] leads from level l to level l + 1 */
 } scene_terrain;
 
 /* Measures a raster, and calibrates its octaves on samples of it so that they get the standard deviations asked for:
- * octaves[0 ... SCENE_LEVEL_MAX - 1], of which `levels` are used. */
+ * octaves[0 ... SCENE_LEVEL_MAX - 1], of which `levels` are used. `without`: an or of scene_terrain_part. */
 tl_status scene_terrain_measure(const tl_source *dem, const scene_detail *detail, const scene_octave *octaves,
-                                int levels, uint64_t seed, const tl_run *run, scene_terrain *out, tl_error *error);
+                                int levels, uint64_t seed, unsigned without, const tl_run *run, scene_terrain *out,
+                                tl_error *error);
 
 /* Only what scene_terrain_strengths needs. */
 tl_status scene_terrain_measure_strengths(const tl_source *dem, const scene_detail *detail, const scene_octave *octaves,
