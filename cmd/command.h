@@ -15,7 +15,7 @@ typedef struct command {
     int (*run)(const struct command *self, int argc, const char **argv, bool help);
 } command;
 
-extern const command command_info, command_simplify, command_synth, command_preview, command_noise;
+extern const command command_info, command_simplify, command_synth, command_preview, command_noise, command_stats;
 
 enum { DEFAULT_MEMORY = 512, OPENED_STEPS = 4 };
 

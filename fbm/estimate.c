@@ -150,16 +150,16 @@ static stencils make_stencils(void)
     return s;
 }
 
-/* -1/2 E|x - y|^(2H) for two samples at a lag in children's cells, in units of the parents' distance. */
-static double covariance(int i, int j, double hurst, bool area)
+/* -1/2 E|x - y|^(2H) for two children at a lag in children's cells, in units of the parents' distance. A child is the
+ * mean of points x points evenly spaced ones; 0: of its whole cell, by the midpoint rule. Differences of two members of
+ * such a lattice have triangular weights. */
+static double covariance(int i, int j, double hurst, int points)
 {
-    if (!area)
-        return -0.5 * fbm_pow(0.25 * (i * i + j * j), hurst);
-    /* the difference of two uniform points of unit cells has the triangular density 1 - |u| */
-    double sum = 0, weight = 0;
-    for (int a = 0; a < CELL_STEPS; a++)
-        for (int b = 0; b < CELL_STEPS; b++) {
-            double u = 2 * (a + 0.5) / CELL_STEPS - 1, v = 2 * (b + 0.5) / CELL_STEPS - 1;
+    int n = points ? points : CELL_STEPS / 2;
+    double sum = 0, weight = 0, shift = points ? 0 : 0.5;
+    for (int a = points ? 1 - n : -n; a < n; a++)
+        for (int b = points ? 1 - n : -n; b < n; b++) {
+            double u = (a + shift) / n, v = (b + shift) / n;
             double w = (1 - fabs(u)) * (1 - fabs(v));
             sum += w * fbm_pow(0.25 * ((i + u) * (i + u) + (j + v) * (j + v)), hurst);
             weight += w;
@@ -183,14 +183,19 @@ static double detail_variance(const double covariances[WIDE][WIDE], const double
     return sum;
 }
 
-double fbm_detail_of_fbm(double hurst, bool area)
+double fbm_detail_of_means(double hurst, int points)
 {
     double covariances[WIDE][WIDE];
     for (int j = 0; j < WIDE; j++)
         for (int i = j; i < WIDE; i++)
-            covariances[j][i] = covariances[i][j] = covariance(i, j, hurst, area);
+            covariances[j][i] = covariances[i][j] = covariance(i, j, hurst, points);
     const stencils s = make_stencils();
     /* x and y alike; the mixed detail's prediction is the product of the slopes */
     return 2 * detail_variance(covariances, s.haar, s.mean, s.slope, s.mean) +
            detail_variance(covariances, s.haar, s.haar, s.slope, s.slope);
+}
+
+double fbm_detail_of_fbm(double hurst, bool area)
+{
+    return fbm_detail_of_means(hurst, area ? 0 : 1);
 }

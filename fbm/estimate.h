@@ -21,7 +21,7 @@ enum { FBM_DETAIL_BEFORE = 12, FBM_DETAIL_AFTER = 15 };
 
 /* Adds the details of both octaves for the blocks that begin at columns x0 ... x1 - 1 and rows y0 ... y1 - 1 of a
  * window of width x height heights. Octave 0 is the finest (children: the samples themselves), octave 1 that of the 2 x
- * 2 means. Blocks whose support leaves the window or meets a NaN are left out. `scratch` holds 2 * width * height
+ * 2 means. Blocks whose support leaves the window or meets a NaN are left out. `scratch` holds 3 * width * height
  * floats. */
 void fbm_detail_add(const float *heights, size_t width, size_t height, size_t x0, size_t y0, size_t x1, size_t y1,
                     float *scratch, fbm_detail octaves[2]);
@@ -33,5 +33,7 @@ double fbm_detail_variance(const fbm_detail *detail, int octave, double noise);
 /* The same variance for fBm with E|Z(x+h) - Z(x)|^2 = |h|^(2H) and parents at distance 1; `area`: samples are means
  * over their cells, not points. By exact covariance, the cells' means by a 16 x 16 midpoint rule. hurst in (0, 1). */
 double fbm_detail_of_fbm(double hurst, bool area);
+/* The same where the children are means of points x points evenly spaced points (1: points; 0: whole cells). */
+double fbm_detail_of_means(double hurst, int points);
 
 #endif

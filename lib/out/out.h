@@ -6,7 +6,7 @@
 #include "lib/talus.h"
 
 enum { OUT_TILE = 256 }; /* samples on a side of the tiles in which grids are pulled and stored */
-enum { OUT_BANDS = 4 };  /* at most, of out_geotiff_write_bands */
+enum { OUT_BANDS = 5 };  /* at most, of out_geotiff_write_bands */
 
 /* Writers of one format each. They write into an open output and leave committing and aborting to the caller. */
 tl_status out_exr_write(const tl_source *source, tl_output *output, const tl_write_options *options, tl_error *error);

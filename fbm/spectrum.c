@@ -1,0 +1,295 @@
+#include "fbm/spectrum.h"
+
+#include "fbm/elementary.h"
+
+#include <kiss_fft.h>
+
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+
+/* ---- power ---- */
+
+static void subtract_plane(double *z, size_t side)
+{
+    double middle = 0.5 * ((double)side - 1), mean = 0, x = 0, y = 0, n = (double)side;
+    for (size_t j = 0; j < side; j++)
+        for (size_t i = 0; i < side; i++) {
+            mean += z[j * side + i];
+            x += z[j * side + i] * ((double)i - middle);
+            y += z[j * side + i] * ((double)j - middle);
+        }
+    /* sum of squares of (i - middle) over the window: n^2 (n^2 - 1) / 12 */
+    double square = n * n * (n * n - 1) / 12;
+    for (size_t j = 0; j < side; j++)
+        for (size_t i = 0; i < side; i++)
+            z[j * side + i] -= mean / (n * n) + x / square * ((double)i - middle) + y / square * ((double)j - middle);
+}
+
+/* Hann's taper at half samples, with a mean square of 1. */
+static double taper(size_t i, size_t side)
+{
+    double cosine, sine;
+    fbm_turn(2 * i + 1, 2 * side, &cosine, &sine);
+    return sqrt(2.0 / 3) * (1 - cosine);
+}
+
+static void transform_rows(kiss_fft_cfg plan, kiss_fft_cpx *field, size_t side, kiss_fft_cpx *row)
+{
+    for (size_t j = 0; j < side; j++) {
+        kiss_fft(plan, field + j * side, row);
+        memcpy(field + j * side, row, side * sizeof *row);
+    }
+}
+
+static void transpose(kiss_fft_cpx *field, size_t side)
+{
+    for (size_t j = 0; j < side; j++)
+        for (size_t i = 0; i < j; i++) {
+            kiss_fft_cpx keep = field[j * side + i];
+            field[j * side + i] = field[i * side + j];
+            field[i * side + j] = keep;
+        }
+}
+
+fbm_status fbm_spectrum_add(const float *heights, size_t side, double scale, double *power)
+{
+    size_t samples = side * side;
+    double *z = malloc(samples * sizeof *z);
+    kiss_fft_cpx *field = malloc((samples + side) * sizeof *field);
+    kiss_fft_cfg plan = kiss_fft_alloc((int)side, 0, NULL, NULL);
+    fbm_status status = z && field && plan ? FBM_OK : FBM_NO_MEMORY;
+    if (status == FBM_OK) {
+        for (size_t k = 0; k < samples; k++)
+            z[k] = scale * ((double)heights[k] - (double)heights[0]);
+        subtract_plane(z, side);
+        for (size_t k = 0; k < samples; k++)
+            field[k] = (kiss_fft_cpx){(float)(z[k] * taper(k % side, side) * taper(k / side, side)), 0};
+        transform_rows(plan, field, side, field + samples);
+        transpose(field, side);
+        transform_rows(plan, field, side, field + samples);
+        transpose(field, side);
+        for (size_t k = 0; k < samples; k++)
+            power[k] +=
+                ((double)field[k].r * (double)field[k].r + (double)field[k].i * (double)field[k].i) / (double)samples;
+    }
+    free(z);
+    free(field);
+    kiss_fft_free(plan);
+    return status;
+}
+
+/* Cycles a window, from 0 to side / 2 and back. */
+static double cycles(size_t k, size_t side)
+{
+    return k <= side / 2 ? (double)k : (double)k - (double)side;
+}
+
+void fbm_spectrum_radial(const double *power, size_t side, double *radial)
+{
+    size_t count[FBM_SPECTRUM_SIDE_MAX / 2] = {0};
+    memset(radial, 0, side / 2 * sizeof *radial);
+    for (size_t j = 0; j < side; j++)
+        for (size_t i = 0; i < side; i++) {
+            double x = cycles(i, side), y = cycles(j, side);
+            size_t k = (size_t)(sqrt(x * x + y * y) + 0.5);
+            if (k < 1 || k > side / 2)
+                continue;
+            radial[k - 1] += power[j * side + i];
+            count[k - 1]++;
+        }
+    for (size_t k = 0; k < side / 2; k++)
+        radial[k] /= (double)count[k];
+}
+
+/* ---- fit ---- */
+
+enum { ALIASES = 3, FIRST = 5 };
+
+typedef struct ordinates {
+    size_t side;
+    double aspect; /* frequency along rows over that along columns, for as many cycles a window */
+    bool area;
+    double windows, noise;
+    const double *power;
+    double *model, *smeared; /* of side * side */
+} ordinates;
+
+static double sinc_square(double x)
+{
+    if (fabs(x) < 1e-9)
+        return 1;
+    double s = sin(3.14159265358979323846 * x) / (3.14159265358979323846 * x);
+    return s * s;
+}
+
+/* |k|^-(2H+2), k in cycles a sample, over all frequencies that sampling cannot tell apart; those beyond the nearest
+ * ones as an integral over a plane without a disc of their area. */
+static double aliased(const ordinates *o, double x, double y, double hurst)
+{
+    double sum = 0;
+    for (int b = -ALIASES; b <= ALIASES; b++)
+        for (int a = -ALIASES; a <= ALIASES; a++) {
+            double u = (x + a) * o->aspect, v = (y + b) / o->aspect;
+            double term = 1 / fbm_pow(u * u + v * v, hurst + 1);
+            sum += o->area ? term * sinc_square(x + a) * sinc_square(y + b) : term;
+        }
+    double radius_square = (2 * ALIASES + 1) * (2 * ALIASES + 1) / 3.14159265358979323846;
+    return o->area ? sum : sum + 3.14159265358979323846 / hurst / fbm_pow(radius_square, hurst);
+}
+
+/* Hann's taper gives a frequency 1/6, 2/3 and 1/6 of the power at its neighbours and itself, along either axis: the
+ * squares of -1/4, 1/2, -1/4 over their sum. */
+static double smear(const double *model, size_t side, size_t i, size_t j)
+{
+    static const double share[3] = {1.0 / 6, 2.0 / 3, 1.0 / 6};
+    double sum = 0;
+    for (size_t b = 0; b < 3; b++)
+        for (size_t a = 0; a < 3; a++)
+            sum += share[a] * share[b] * model[(j + b + side - 1) % side * side + (i + a + side - 1) % side];
+    return sum;
+}
+
+static void make_model(ordinates *o, double hurst)
+{
+    size_t side = o->side, half = side / 2;
+    for (size_t j = 0; j <= half; j++)
+        for (size_t i = 0; i <= half; i++) {
+            double value = i + j == 0 ? 0 : aliased(o, (double)i / (double)side, (double)j / (double)side, hurst);
+            size_t across = (side - i) % side, down = (side - j) % side;
+            o->model[j * side + i] = o->model[j * side + across] = o->model[down * side + i] =
+                o->model[down * side + across] = value;
+        }
+    for (size_t j = 0; j < side; j++)
+        for (size_t i = 0; i < side; i++)
+            o->smeared[j * side + i] = smear(o->model, side, i, j);
+}
+
+static bool counts(const ordinates *o, size_t i, size_t j)
+{
+    double x = cycles(i, o->side), y = cycles(j, o->side), k2 = x * x + y * y, most = 0.375 * (double)o->side;
+    return k2 >= FIRST * FIRST && k2 <= most * most;
+}
+
+/* The amplitude that is likeliest at the model, by Newton's rule from the mean ratio, and minus the likelihood's
+ * logarithm. */
+static double likelihood(ordinates *o, double hurst, double *amplitude)
+{
+    make_model(o, hurst);
+    double a = 0, n = 0, sum = 0;
+    for (size_t j = 0; j < o->side; j++)
+        for (size_t i = 0; i < o->side; i++)
+            if (counts(o, i, j)) {
+                double clean = o->power[j * o->side + i] - o->noise;
+                a += clean / o->smeared[j * o->side + i];
+                n++;
+            }
+    a = a / n > 0 ? a / n : 1e-300;
+    for (int round = 0; round < 8 && o->noise > 0; round++) {
+        double slope = 0, bend = 0;
+        for (size_t k = 0; k < o->side * o->side; k++)
+            if (counts(o, k % o->side, k / o->side)) {
+                double m = o->smeared[k], f = a * m + o->noise;
+                slope += (o->power[k] - f) * m / (f * f);
+                bend += m * m / (f * f);
+            }
+        double next = a + slope / bend;
+        a = next > 0.1 * a ? next : 0.1 * a;
+    }
+    for (size_t k = 0; k < o->side * o->side; k++)
+        if (counts(o, k % o->side, k / o->side)) {
+            double f = a * o->smeared[k] + o->noise;
+            sum += log(f) + o->power[k] / f;
+        }
+    *amplitude = a;
+    return sum;
+}
+
+/* Of independent exponential ordinates, half of which repeat the others: the information on H with the amplitude free
+ * is 1/2 sum (g - mean g)^2, g the model's logarithmic slope in H. Hann's taper makes an ordinate share (35/18)^2 in
+ * the two directions with its neighbours: as many times fewer are independent. */
+static double error_of(ordinates *o, double hurst, double amplitude)
+{
+    size_t samples = o->side * o->side;
+    double *before = malloc(samples * sizeof *before), sum = 0, squares = 0, n = 0;
+    if (!before)
+        return (double)NAN;
+    make_model(o, hurst - 0.005);
+    memcpy(before, o->smeared, samples * sizeof *before);
+    make_model(o, hurst + 0.005);
+    double weight = 0;
+    for (size_t k = 0; k < samples; k++)
+        if (counts(o, k % o->side, k / o->side)) {
+            double share = 1 / (1 + o->noise / (amplitude * o->smeared[k])); /* what is not noise */
+            double g = (log(o->smeared[k]) - log(before[k])) / 0.01 * share;
+            sum += g * share;
+            squares += g * g;
+            weight += share * share;
+            n++;
+        }
+    free(before);
+    double information = 0.5 * o->windows * (squares - sum * sum / weight) / (35.0 / 18 * 35 / 18);
+    return n > 2 && information > 0 ? 1 / sqrt(information) : (double)NAN;
+}
+
+/* Golden section over H. */
+static double likeliest(ordinates *o, double *amplitude)
+{
+    const double golden = 0.61803398874989485;
+    double low = 0.01, high = 1.95, a = high - golden * (high - low), b = low + golden * (high - low);
+    double at_a = likelihood(o, a, amplitude), at_b = likelihood(o, b, amplitude);
+    for (int k = 0; k < 16; k++) {
+        if (at_a < at_b) {
+            high = b;
+            b = a;
+            at_b = at_a;
+            a = high - golden * (high - low);
+            at_a = likelihood(o, a, amplitude);
+        } else {
+            low = a;
+            a = b;
+            at_a = at_b;
+            b = low + golden * (high - low);
+            at_b = likelihood(o, b, amplitude);
+        }
+    }
+    double hurst = 0.5 * (low + high);
+    likelihood(o, hurst, amplitude);
+    return hurst;
+}
+
+/* The spectrum of fBm in the plane with E|Z(x+h) - Z(x)|^2 = |h|^2H is c |k|^-(2H+2), k in cycles,
+ * c = H 2^(2H) Gamma(1+H) / (pi Gamma(1-H)) (2 pi)^-2H / (2 pi)^0 ... written out: S(h) = 2 int (1 - cos 2 pi k h)
+ * f(k). */
+static double spectral_constant(double hurst)
+{
+    const double pi = 3.14159265358979323846;
+    return hurst * exp(lgamma(1 + hurst) - lgamma(1 - hurst)) / (2 * pi * pow(pi, 2 * hurst));
+}
+
+fbm_status fbm_spectrum_fit_power(const double *power, size_t side, double windows, double cell_x, double cell_y,
+                                  bool area, double noise, fbm_spectrum_fit *out)
+{
+    size_t samples = side * side;
+    *out = (fbm_spectrum_fit){0};
+    double *room = malloc(2 * samples * sizeof *room);
+    if (!room)
+        return FBM_NO_MEMORY;
+    ordinates o = {.side = side,
+                   .aspect = sqrt(cell_y / cell_x),
+                   .area = area,
+                   .windows = windows,
+                   .noise = noise,
+                   .power = power,
+                   .model = room,
+                   .smeared = room + samples};
+    double amplitude;
+    out->hurst = likeliest(&o, &amplitude);
+    out->hurst_error = error_of(&o, out->hurst, amplitude);
+    out->known = isfinite(out->hurst_error) && out->hurst > 0.011 && out->hurst < 1.94;
+    if (out->hurst < 0.995)
+        out->delta = sqrt(amplitude / spectral_constant(out->hurst)) /
+                     fbm_pow(cell_x * cell_y, 0.5 * out->hurst); /* from samples to the unit of distance */
+    free(room);
+    return FBM_OK;
+}
