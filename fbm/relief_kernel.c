@@ -642,12 +642,13 @@ static const float gauss[SMOOTHING + 1] = {1,          .8824969F,   .60653066F, 
 
 static void smooth_across(const float *in, ptrdiff_t stride, size_t count, float *restrict out)
 {
-    for (size_t k = 0; k < count; k++) {
-        const float *at = in + k;
-        float sum = at[0];
-        for (int t = 1; t <= SMOOTHING; t++)
-            sum += gauss[t] * (at[-t * stride] + at[t * stride]);
-        out[k] = sum;
+    for (size_t k = 0; k < count; k++)
+        out[k] = in[k] + gauss[1] * (in[(ptrdiff_t)k - stride] + in[(ptrdiff_t)k + stride]);
+    for (int t = 2; t <= SMOOTHING; t++) {
+        const float *before = in - t * stride, *after = in + t * stride;
+        const float weight = gauss[t];
+        for (size_t k = 0; k < count; k++)
+            out[k] += weight * (before[k] + after[k]);
     }
 }
 
