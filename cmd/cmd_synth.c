@@ -1,18 +1,27 @@
 #include "cmd/command.h"
 
+#include <math.h>
 #include <stdio.h>
+#include <stdlib.h>
 #include <string.h>
+#include <strings.h>
+#include <unistd.h>
 
 static const char *const compressions[] = {
     [TL_COMPRESSION_DEFAULT] = "default", [TL_COMPRESSION_NONE] = "none", [TL_COMPRESSION_ZIP] = "zip",
     [TL_COMPRESSION_ZIPS] = "zips",       [TL_COMPRESSION_PIZ] = "piz",   NULL};
+static const char *const supports[] = {
+    [TL_SUPPORT_RASTER] = "raster", [TL_SUPPORT_AREA] = "area", [TL_SUPPORT_POINT] = "point", NULL};
+
 typedef struct settings {
     common common;
     tl_field_options field;
     tl_noise_options noise;
     int64_t levels, seed;
-    int compression, frame;
+    int compression, frame, support;
     bool size_given, hurst_given, delta_given;
+    double max_error; /* of the framework that the DEM is reduced to first */
+    bool max_error_given, verify;
 } settings;
 
 static void report(const settings *set, const tl_source *made, double seconds)
@@ -42,21 +51,142 @@ static int write_out(const settings *set, const tl_source *made, const tl_run *r
 
 /* ---- synth ---- */
 
+/* What is refined: the DEM, or what its framework, made here or read, keeps of it. */
+typedef struct ground {
+    opened_input opened;
+    tl_framework *framework;
+    tl_source *restored;
+    const tl_source *dem; /* NULL: out of a framework's file */
+} ground;
+
+static void close_ground(ground *of)
+{
+    tl_source_destroy(of->restored);
+    tl_framework_destroy(of->framework);
+    if (of->opened.source)
+        command_close(&of->opened);
+}
+
+/* The source to refine; NULL on failure. */
+static const tl_source *open_ground(const settings *set, const arguments *inputs, const tl_run *run, ground *of,
+                                    tl_error *error)
+{
+    bool file = inputs->count == 1 && tl_framework_is_file(inputs->names[0]);
+    *of = (ground){.dem = NULL};
+    if (file && (set->max_error_given || set->verify)) {
+        *error = (tl_error){.status = TL_ERROR_ARGUMENT};
+        snprintf(error->text, sizeof error->text,
+                 "%.300s: is a framework with a bound of its own; leave --max-error and --verify away",
+                 inputs->names[0]);
+        return NULL;
+    }
+    if (file)
+        of->framework = tl_framework_load(inputs->names[0], run, error);
+    else {
+        of->opened = command_open(&set->common, inputs, run, error);
+        of->dem = of->opened.source;
+        if (!of->dem || !set->max_error_given)
+            return of->dem;
+        tl_framework_options options = {.max_error = set->max_error, .frame = TL_FRAME_PIXEL, .run = run};
+        of->framework = tl_framework_build(of->dem, &options, error);
+    }
+    if (!of->framework)
+        return NULL;
+    tl_restore_options options = {.hurst_given = set->field.hurst_given,
+                                  .delta_given = set->field.delta_given,
+                                  .hurst = set->field.hurst,
+                                  .delta = set->field.delta,
+                                  .seed = set->field.seed,
+                                  .run = run};
+    of->restored = tl_framework_restore(of->framework, of->dem, &options, error);
+    return of->restored;
+}
+
+static void report_framework(const settings *set, const ground *of)
+{
+    if (of->framework)
+        command_say(&set->common, "framework: %zu points (%.3g %% of the samples), error <= %g",
+                    tl_framework_point_count(of->framework),
+                    100 * (double)tl_framework_point_count(of->framework) /
+                        ((double)of->restored->info.width * (double)of->restored->info.height),
+                    tl_framework_max_error(of->framework));
+}
+
+/* The largest difference between the DEM and every `step`-th sample of `level` of a source; infinite where one of them
+ * is void and the other is not. */
+static tl_status compare(const tl_source *dem, const tl_source *made, int level, int64_t step, double *worst,
+                         tl_error *error)
+{
+    int64_t width = (dem->info.width - 1) * step + 1;
+    float *rows = calloc((size_t)(dem->info.width + width), sizeof *rows), *other = rows + dem->info.width;
+    tl_status status = TL_OK;
+    *worst = 0;
+    for (int64_t y = 0; rows && status == TL_OK && y < dem->info.height; y++) {
+        status = tl_source_read(dem, dem->info.level, (tl_window){0, y, dem->info.width, 1}, rows, error);
+        if (status == TL_OK)
+            status = tl_source_read(made, level, (tl_window){0, y * step, width, 1}, other, error);
+        for (int64_t x = 0; status == TL_OK && x < dem->info.width; x++) {
+            double off = fabs((double)rows[x] - (double)other[x * step]);
+            if (isnan(off))
+                off = isnan(rows[x]) && isnan(other[x * step]) ? 0 : HUGE_VAL;
+            *worst = off > *worst ? off : *worst;
+        }
+    }
+    free(rows);
+    if (rows)
+        return status;
+    *error = (tl_error){TL_ERROR_MEMORY, "not enough memory to verify"};
+    return TL_ERROR_MEMORY;
+}
+
+/* Measures what was made against the DEM: its level 0, and, where samples are points, those in the file. */
+static int verify(const settings *set, const ground *of, const tl_source *field, progress *bar)
+{
+    tl_error error;
+    double inside = 0, outside = 0;
+    progress_stage(bar, "verifying");
+    const char *dot = strrchr(set->common.output, '.');
+    bool grid = dot && (strcasecmp(dot, ".exr") == 0 || strcasecmp(dot, ".tif") == 0 || strcasecmp(dot, ".tiff") == 0);
+    bool points = of->dem->info.type == TL_RASTER_POINT || set->levels == 0;
+    tl_source *file = grid && points ? tl_open(set->common.output, &error) : NULL;
+    tl_status status = grid && points && !file ? TL_ERROR_IO : compare(of->dem, field, 0, 1, &inside, &error);
+    if (status == TL_OK && file)
+        status = compare(of->dem, file, file->info.level, INT64_C(1) << set->levels, &outside, &error);
+    tl_source_destroy(file);
+    if (status != TL_OK)
+        return command_failed(bar, &error);
+    progress_end(bar);
+    double worst = fmax(inside, outside);
+    if (!(worst <= set->max_error)) {
+        complain("%s: %.9g from the DEM, more than %.9g; that is a fault of talus, please report it",
+                 set->common.output, worst, set->max_error);
+        unlink(set->common.output);
+        return EXIT_FAILED;
+    }
+    command_say(&set->common, "verified: largest error %.7g%s", worst, file ? ", in the file" : ", before refinement");
+    return EXIT_DONE;
+}
+
 static int synth(settings *set, const arguments *inputs)
 {
     progress bar;
     tl_error error;
     tl_run run = command_run(&set->common, &bar);
-    opened_input opened = command_open(&set->common, inputs, &run, &error);
-    const tl_source *dem = opened.source;
-    if (!dem)
+    ground of;
+    const tl_source *dem = open_ground(set, inputs, &run, &of, &error);
+    if (!dem) {
+        close_ground(&of);
         return command_failed(&bar, &error);
+    }
+    report_framework(set, &of);
     progress_stage(&bar, "measuring");
     set->field.run = &run;
     tl_source *field = tl_field_create(dem, &set->field, &error);
     int status = field ? write_out(set, field, &run, &bar) : command_failed(&bar, &error);
+    if (status == EXIT_DONE && set->verify)
+        status = verify(set, &of, field, &bar);
     tl_source_destroy(field);
-    command_close(&opened);
+    close_ground(&of);
     return status;
 }
 
@@ -65,7 +195,7 @@ static size_t schemes_of(bool noise, tl_scheme out[16])
 {
     size_t count = 0;
     for (const tl_scheme *s = tl_schemes(); s->name && count < 16; s++)
-        if (s->noise || !noise)
+        if (noise ? s->noise : s->field)
             out[count++] = *s;
     return count;
 }
@@ -105,8 +235,16 @@ static int run_synth(const command *self, int argc, const char **argv, bool help
          "standard deviation of the height difference over one DEM sample, in the DEM's unit, 0...1e30 (default: "
          "measured)",
          0, 1e30, NULL},
+        {"max-error", 'e', OPTION_NUMBER, &set.max_error, &set.max_error_given, "E",
+         "reduce the DEM to its framework first; what that drops is made again, within E of every sample, 0...1e30", 0,
+         1e30, NULL},
+        {"verify", 0, OPTION_FLAG, &set.verify, NULL, NULL, "with --max-error: measure the result against the DEM", 0,
+         0, NULL},
         {"scheme", 0, OPTION_TEXT, &set.field.scheme, NULL, "NAME",
          "way to refine, listed below (default: terrain; stationary with --hurst or --delta)", 0, 0, NULL},
+        {"support", 0, OPTION_CHOICE, &set.support, NULL, "KIND",
+         "what the samples stand for: raster, area (means over cells) or point (default: raster, what the file says)",
+         0, 0, supports},
         {0}};
     const option input[] = {COMMON_INPUT(set.common), {0}};
     const option output[] = {COMMON_OUTPUT(set.common),
@@ -126,8 +264,13 @@ static int run_synth(const command *self, int argc, const char **argv, bool help
     }
     set.field.levels = (int)set.levels;
     set.field.seed = (uint64_t)set.seed;
+    set.field.support = (tl_support)set.support;
     bool good =
         (!set.field.scheme || names_scheme(set.field.scheme, false)) && command_output_ok(&set.common, true, true);
+    if (good && set.verify && !set.max_error_given) {
+        complain("--verify measures against --max-error E; give that too");
+        good = false;
+    }
     status = good ? synth(&set, &rest) : EXIT_USAGE;
     arguments_free(&rest);
     return status;
@@ -155,18 +298,20 @@ static int noise(settings *set)
 static int run_noise(const command *self, int argc, const char **argv, bool help)
 {
     settings set = {.noise = {.size = 1024, .hurst = 0.8, .delta = 1}};
-    const option surface[] = {{"size", 'n', OPTION_INTEGER, &set.noise.size, NULL, "N",
-                               "samples on a side, 1...2^24 (default: 1024)", 1, 16777216, NULL},
-                              {"hurst", 0, OPTION_NUMBER, &set.noise.hurst, NULL, "H",
-                               "Hurst exponent, 0.01...0.99 (default: 0.8)", 0.01, 0.99, NULL},
-                              {"delta", 0, OPTION_NUMBER, &set.noise.delta, NULL, "D",
-                               "standard deviation of the height difference over one sample, 0...1e30 (default: 1)", 0,
-                               1e30, NULL},
-                              {"seed", 's', OPTION_INTEGER, &set.seed, NULL, "N",
-                               "another seed, another surface, 0...2^62 (default: 0)", 0, 0x1p62, NULL},
-                              {"scheme", 0, OPTION_TEXT, &set.noise.scheme, NULL, "NAME",
-                               "way to refine, listed below (default: the first)", 0, 0, NULL},
-                              {0}};
+    const option surface[] = {
+        {"size", 'n', OPTION_INTEGER, &set.noise.size, NULL, "N", "samples on a side, 1...2^24 (default: 1024)", 1,
+         16777216, NULL},
+        {"hurst", 0, OPTION_NUMBER, &set.noise.hurst, NULL, "H", "Hurst exponent, 0.01...0.99 (default: 0.8)", 0.01,
+         0.99, NULL},
+        {"delta", 0, OPTION_NUMBER, &set.noise.delta, NULL, "D",
+         "standard deviation of the height difference over one sample, 0...1e30 (default: 1)", 0, 1e30, NULL},
+        {"seed", 's', OPTION_INTEGER, &set.seed, NULL, "N", "another seed, another surface, 0...2^62 (default: 0)", 0,
+         0x1p62, NULL},
+        {"scheme", 0, OPTION_TEXT, &set.noise.scheme, NULL, "NAME", "way to refine, listed below (default: the first)",
+         0, 0, NULL},
+        {"aspect", 0, OPTION_NUMBER, &set.noise.aspect, NULL, "R",
+         "width of a cell over its height, 0.2...5; delta is then over the height (default: 1)", 0.2, 5, NULL},
+        {0}};
     const option output[] = {COMMON_OUTPUT(set.common),
                              {"compression", 0, OPTION_CHOICE, &set.compression, NULL, "KIND",
                               "of .exr and .tif (default: zip)", 0, 0, compressions},

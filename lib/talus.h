@@ -589,6 +589,22 @@ typedef struct tl_field_options {
  * W 2^l by H 2^l cells on the same footprint. Voids stay voids. */
 TL_API tl_source *tl_field_create(const tl_source *dem, const tl_field_options *options, tl_error *error);
 
+typedef struct tl_restore_options {
+    bool hurst_given, delta_given;
+    double hurst, delta; /* as in tl_field_options; where not given, those of the framework's file, else measured */
+    uint64_t seed;
+    const tl_run *run;
+} tl_restore_options;
+
+/* The elevation model again, of the same samples, from its framework alone or with the model: points keep their
+ * heights, and what was dropped is the triangles' surface with fractal detail, made from coarse to fine by kriging of
+ * what is known around. No sample is farther than the framework's bound from the surface; given the model, none is
+ * farther from it either, else twice as far at most. (That of a framework whose bound varies is the largest.) Samples
+ * in no triangle are the model's, or void. It is made here and kept, 4 bytes a sample, and refines as any model does by
+ * tl_field_create. Needs the framework and the model only until it returns. */
+TL_API tl_source *tl_framework_restore(const tl_framework *framework, const tl_source *dem,
+                                       const tl_restore_options *options, tl_error *error);
+
 /* Roughness of an elevation model: the detail that its finest halving of spacing added. */
 typedef struct tl_roughness {
     bool measurable; /* false: too small, too flat or too void to tell; the rest is then 0 */
