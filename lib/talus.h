@@ -190,6 +190,10 @@ TL_API tl_source *tl_array_source_create(const float *heights, const tl_source_i
  */
 TL_API tl_source *tl_open(const char *path, tl_error *error);
 
+/* Heights rounded to multiples of `quantum` (units of height, above 0): a field in steps of 1/64 m takes half the room in a
+ * compressed file. No height moves by more than half of it. */
+TL_API tl_source *tl_quantized_create(const tl_source *source, double quantum, tl_error *error);
+
 /* ---- Elevation models -------------------------------------------------------------------------- */
 
 typedef struct tl_dem_options {
