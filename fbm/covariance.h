@@ -23,4 +23,16 @@ typedef struct fbm_deviation {
 fbm_status fbm_structure_deviation(const fbm_scheme *scheme, const fbm_weights *weights, double hurst, int levels,
                                    int cells, fbm_deviation *out);
 
+/* The same for cells that are `aspect` wide and 1 high, whose rows are halved first. `weights` are for the aspect times
+ * 2^halvings, rows[k] for the step after k halvings. Lags are counted in samples of the finest lattice. */
+typedef struct fbm_refinement {
+    const fbm_scheme *scheme;
+    double hurst, aspect;
+    const fbm_weights *weights;
+    int halvings; /* 0 ... 2 */
+    const fbm_row_weights *rows;
+} fbm_refinement;
+
+fbm_status fbm_refinement_deviation(const fbm_refinement *refinement, int levels, int cells, fbm_deviation *out);
+
 #endif

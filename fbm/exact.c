@@ -21,7 +21,8 @@
 typedef struct embedding {
     size_t size;   /* samples on a side of the output */
     size_t period; /* samples on a side of the torus, even and 5-smooth */
-    double radius; /* samples */
+    double aspect; /* distance of columns, rows being at distance 1 */
+    double radius; /* rows */
     double hurst;  /* a = 2 H */
     double reach;  /* R */
     double b, c0, c2;
@@ -43,11 +44,11 @@ static size_t smooth_even(size_t n)
     }
 }
 
-static embedding plan(size_t size, double hurst)
+static embedding plan(size_t size, double aspect, double hurst)
 {
-    embedding e = {.size = size, .hurst = hurst, .reach = 1};
+    embedding e = {.size = size, .aspect = aspect, .hurst = hurst, .reach = 1};
     double a = 2 * hurst;
-    e.radius = (double)(size - 1) * sqrt(2);
+    e.radius = (double)(size - 1) * sqrt(1 + aspect * aspect);
     e.c2 = hurst;
     e.c0 = 1 - hurst;
     if (a > 1.5) { /* R = 1 has negative eigenvalues there */
@@ -56,7 +57,7 @@ static embedding plan(size_t size, double hurst)
         e.c2 = (a - e.b * (R - 1) * (R - 1) * (R + 2)) / 2;
         e.c0 = e.b * (R - 1) * (R - 1) * (R - 1) + 1 - e.c2;
     }
-    e.period = smooth_even(2 * ((size_t)ceil(e.radius * e.reach) + 1));
+    e.period = smooth_even(2 * ((size_t)ceil(e.radius * e.reach / fmin(aspect, 1)) + 1));
     return e;
 }
 
@@ -145,8 +146,10 @@ static void make_spectrum(const embedding *e, double *s, complex_double *work)
     size_t half = e->period / 2, side = half + 1;
     double scale = e->radius > 0 ? 1 / e->radius : 0;
     for (size_t y = 0; y <= half; y++)
-        for (size_t x = 0; x <= half; x++)
-            s[y * side + x] = covariance(e, sqrt((double)(x * x + y * y)) * scale);
+        for (size_t x = 0; x <= half; x++) {
+            double dx = (double)x * e->aspect, dy = (double)y;
+            s[y * side + x] = covariance(e, sqrt(dx * dx + dy * dy) * scale);
+        }
     complex_double *roots = work + 2 * e->period;
     make_roots(roots, e->period);
     /* of an odd last row or column both halves of the pair are the same, and get the same result */
@@ -213,7 +216,7 @@ static void finish_field(const embedding *e, double delta, uint64_t seed, float 
     double scale = delta * fbm_pow(e->radius, e->hurst) / sqrt(2), first = (double)out[0];
     for (size_t y = 0; y < e->size; y++)
         for (size_t x = 0; x < e->size; x++) {
-            double tilt = plane * ((double)x * (double)slopes[0] + (double)y * (double)slopes[1]);
+            double tilt = plane * ((double)x * e->aspect * (double)slopes[0] + (double)y * (double)slopes[1]);
             float *z = out + y * e->size + x;
             *z = (float)(((double)*z - first + tilt) * scale);
         }
@@ -239,13 +242,12 @@ static bool workspace_bytes(const embedding *e, size_t bytes[6])
     return good;
 }
 
-size_t fbm_exact_memory(size_t size, double hurst)
+static size_t memory(const embedding *e)
 {
     size_t bytes[6], sum = 0;
-    if (size < 1 || size > FBM_EXACT_SIZE_MAX)
+    if (e->size < 1 || e->size > FBM_EXACT_SIZE_MAX)
         return 0;
-    embedding e = plan(size, fbm_hurst_clamp(hurst));
-    if (!workspace_bytes(&e, bytes))
+    if (!workspace_bytes(e, bytes))
         return 0;
     for (int k = 0; k < 6; k++) {
         if (bytes[k] > SIZE_MAX - sum)
@@ -253,6 +255,12 @@ size_t fbm_exact_memory(size_t size, double hurst)
         sum += bytes[k];
     }
     return sum;
+}
+
+size_t fbm_exact_memory(size_t size, double aspect, double hurst)
+{
+    embedding e = plan(size, aspect, fbm_hurst_clamp(hurst));
+    return memory(&e);
 }
 
 static bool allocate(const embedding *e, workspace *ws)
@@ -280,9 +288,14 @@ static void release(workspace *ws)
 
 fbm_status fbm_exact(size_t size, double hurst, double delta, uint64_t seed, float *out)
 {
-    if (!fbm_exact_memory(size, hurst))
+    return fbm_exact_cells(size, 1, hurst, delta, seed, out);
+}
+
+fbm_status fbm_exact_cells(size_t size, double aspect, double hurst, double delta, uint64_t seed, float *out)
+{
+    embedding e = plan(size, aspect, fbm_hurst_clamp(hurst));
+    if (!memory(&e))
         return FBM_TOO_LARGE;
-    embedding e = plan(size, fbm_hurst_clamp(hurst));
     workspace ws = {NULL};
     if (!allocate(&e, &ws)) {
         release(&ws);

@@ -77,23 +77,23 @@ static void centre_partials(const fbm_centre_job *job, size_t count, float *rest
 {
     const float *restrict z0 = job->z[0], *restrict z1 = job->z[1], *restrict z2 = job->z[2], *restrict z3 = job->z[3],
                           *restrict z4 = job->z[4], *restrict z5 = job->z[5];
-    const float w0 = job->w[0], w1 = job->w[1], w2 = job->w[2], w3 = job->w[3];
+    const float w0 = job->w[0], w1 = job->w[1], w2 = job->w[2], w3 = job->w[3], w4 = job->w[4], w5 = job->w[5];
     for (size_t k = 0; k < count; k++) {
         float near = z2[k] + z3[k], middle = z1[k] + z4[k], far = z0[k] + z5[k];
-        u[k] = (w0 * near + w1 * middle) + w3 * far;
-        v[k] = w1 * near + w2 * middle;
-        q[k] = w3 * near;
+        u[k] = (w0 * near + w2 * middle) + w5 * far;
+        v[k] = w1 * near + w3 * middle;
+        q[k] = w4 * near;
     }
 }
 
 static void centre_noise_partials(const fbm_centre_job *job, size_t count, float *restrict m0, float *restrict m1)
 {
     const float *restrict above = job->g[0], *restrict at = job->g[1], *restrict below = job->g[2];
-    const float t0 = job->t[0], t1 = job->t[1], t2 = job->t[2];
+    const float t0 = job->t[0], t1 = job->t[1], t2 = job->t[2], t3 = job->t[3];
     for (size_t k = 0; k < count; k++) {
         float beside = above[k] + below[k];
-        m0[k] = t0 * at[k] + t1 * beside;
-        m1[k] = t1 * at[k] + t2 * beside;
+        m0[k] = t0 * at[k] + t2 * beside;
+        m1[k] = t1 * at[k] + t3 * beside;
     }
 }
 
@@ -127,11 +127,11 @@ static void centres(const fbm_centre_job *job, size_t count)
 static void side_partials(const fbm_edge_job *job, size_t count, float *restrict a, float *restrict b)
 {
     const float *restrict above = job->side[0], *restrict at = job->side[1], *restrict below = job->side[2];
-    const float w0 = job->w[0], w1 = job->w[1], w2 = job->w[2], w3 = job->w[3];
+    const float w0 = job->w[0], w2 = job->w[2], w5 = job->w[5], w7 = job->w[7];
     for (size_t k = 0; k < count; k++) {
         float beside = above[k] + below[k];
-        a[k] = w0 * at[k] + w1 * beside;
-        b[k] = w2 * at[k] + w3 * beside;
+        a[k] = w0 * at[k] + w2 * beside;
+        b[k] = w5 * at[k] + w7 * beside;
     }
 }
 
@@ -139,11 +139,11 @@ static void side_noisy_partials(const fbm_edge_job *job, size_t count, float *re
 {
     const float *restrict above = job->side[0], *restrict at = job->side[1], *restrict below = job->side[2],
                           *restrict g0 = job->other[0], *restrict g1 = job->other[1];
-    const float w0 = job->w[0], w1 = job->w[1], w2 = job->w[2], w3 = job->w[3], t1 = job->t[1];
+    const float w0 = job->w[0], w2 = job->w[2], w5 = job->w[5], w7 = job->w[7], t1 = job->t[1];
     for (size_t k = 0; k < count; k++) {
         float beside = above[k] + below[k];
-        a[k] = (w0 * at[k] + w1 * beside) + t1 * (g0[k] + g1[k]);
-        b[k] = w2 * at[k] + w3 * beside;
+        a[k] = (w0 * at[k] + w2 * beside) + t1 * (g0[k] + g1[k]);
+        b[k] = w5 * at[k] + w7 * beside;
     }
 }
 
@@ -152,11 +152,11 @@ static void same_partials(const fbm_edge_job *job, size_t count, float *restrict
 {
     const float *restrict c0 = job->same[0], *restrict c1 = job->same[1], *restrict c2 = job->same[2],
                           *restrict c3 = job->same[3];
-    const float w0 = job->w[0], w1 = job->w[1], w2 = job->w[2], w3 = job->w[3];
+    const float w1 = job->w[1], w3 = job->w[3], w4 = job->w[4], w6 = job->w[6];
     for (size_t k = 0; k < count; k++) {
         float near = c1[k] + c2[k], far = c0[k] + c3[k];
-        d[k] = w0 * near + w2 * far;
-        e[k] = w1 * near + w3 * far;
+        d[k] = w1 * near + w4 * far;
+        e[k] = w3 * near + w6 * far;
     }
 }
 
@@ -165,11 +165,12 @@ static void same_noisy_partials(const fbm_edge_job *job, size_t count, float *re
     const float *restrict c0 = job->same[0], *restrict c1 = job->same[1], *restrict c2 = job->same[2],
                           *restrict c3 = job->same[3], *restrict above = job->g[0], *restrict at = job->g[1],
                           *restrict below = job->g[2];
-    const float w0 = job->w[0], w1 = job->w[1], w2 = job->w[2], w3 = job->w[3], t0 = job->t[0], t2 = job->t[2];
+    const float w1 = job->w[1], w3 = job->w[3], w4 = job->w[4], w6 = job->w[6], t0 = job->t[0], t2 = job->t[2],
+                t3 = job->t[3];
     for (size_t k = 0; k < count; k++) {
         float near = c1[k] + c2[k], far = c0[k] + c3[k];
-        d[k] = (w0 * near + w2 * far) + (t0 * at[k] + t2 * (above[k] + below[k]));
-        e[k] = (w1 * near + w3 * far) + t2 * at[k];
+        d[k] = (w1 * near + w4 * far) + (t0 * at[k] + t3 * (above[k] + below[k]));
+        e[k] = (w3 * near + w6 * far) + t2 * at[k];
     }
 }
 

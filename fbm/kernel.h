@@ -11,7 +11,7 @@
 typedef struct fbm_centre_job {
     const float *z[6]; /* rows j - 2 ... j + 3, from column i - 2: count + 5 */
     const float *g[3]; /* centre noise of rows j - 1 ... j + 1, from column i - 1: count + 2 */
-    float w[4], t[3];
+    float w[6], t[4];  /* orbits as in fbm_weights */
     float *partial[5]; /* scratch rows of count + 5 */
     float *out;        /* count centres from column i */
 } fbm_centre_job;
@@ -23,7 +23,7 @@ typedef struct fbm_edge_job {
     const float *same[4];  /* rows -3/2, -1/2, +1/2, +3/2, from 1 cell before: count + 2 */
     const float *g[3];     /* noise of this orientation, rows -1, 0, +1, from 1 cell before: count + 2 */
     const float *other[2]; /* noise of the other one, rows -1/2, +1/2, from 3/2 cells before: count + 3 */
-    float w[4], t[3];
+    float w[8], t[4];
     float *partial[4]; /* scratch rows of count + 3 */
     float *out;        /* count edges */
 } fbm_edge_job;
@@ -48,9 +48,22 @@ typedef struct fbm_kernel {
 /* The kernels that were built and that this processor runs, best first, ended by NULL; the last is the portable one. */
 const fbm_kernel *const *fbm_kernels(void);
 
+/* Noise of a step, columns counted modulo `period` unless that is 0. */
+void fbm_step_noise(const fbm_kernel *kernel, const fbm_step *step, int64_t period, fbm_noise_kind kind, int64_t row,
+                    int64_t first, size_t count, float *out);
+
+/* The schemes that do not keep old samples (classic.c); the output must not be empty. */
+size_t fbm_classic_scratch(void);
+void fbm_classic_refine(const fbm_kernel *kernel, const fbm_step *step, bool children, const float *in,
+                        const float *map, fbm_window in_window, float *out, fbm_window out_window, float *scratch);
+void fbm_successive_centres(const fbm_kernel *kernel, const fbm_step *step, const float *in, const float *map,
+                            fbm_window in_window, float *out, fbm_window cells, float *scratch);
+
 /* fbm_refine_mapped and fbm_centres_mapped with a kernel of the caller's choice; `map` may be NULL. */
 void fbm_refine_by(const fbm_kernel *kernel, const fbm_step *step, const float *in, const float *map,
                    fbm_window in_window, float *out, fbm_window out_window, float *scratch);
+void fbm_refine_rows_by(const fbm_kernel *kernel, const fbm_row_step *step, const float *in, const float *map,
+                        fbm_window in_window, float *out, fbm_window out_window, float *scratch);
 void fbm_centres_by(const fbm_kernel *kernel, const fbm_step *step, const float *in, const float *map,
                     fbm_window in_window, float *out, fbm_window cells, float *scratch);
 

@@ -8,14 +8,20 @@
 #include <stdbool.h>
 #include <string.h>
 
-enum { RULE_STENCIL24, RULE_MEANS };
+enum { RULE_STENCIL24, RULE_MEANS, RULE_CHILDREN, RULE_ADDITIONS };
 
 const fbm_scheme fbm_schemes[] = {
     {"stationary", "fractional Brownian motion: 24-point predictor, filtered residual (within 1 % of theory)",
-     fbm_weights_stationary, 4, 2, 3, RULE_STENCIL24},
+     fbm_weights_stationary, fbm_values_stationary, 4, 2, 3, RULE_STENCIL24, false, false},
     {"square", "square subdivision of Hu and Wang: means of corners and ends, independent noise (for comparison)",
-     fbm_weights_square, 1, 0, 1, RULE_MEANS},
-    {NULL, NULL, NULL, 0, 0, 0, 0},
+     fbm_weights_square, fbm_values_square, 1, 0, 1, RULE_MEANS, false, false},
+    {"diamond-square", "means of four corners, then of four neighbours, independent noise (for comparison)",
+     fbm_weights_diamond, fbm_values_diamond, 4, 2, 3, RULE_STENCIL24, false, false},
+    {"square-square", "Miller's subdivision of cells by weights 9, 3, 3, 1 (for comparison; moves samples)",
+     fbm_weights_children, fbm_values_children, 1, 0, 0, RULE_CHILDREN, true, true},
+    {"successive", "diamond-square with Voss's additions to the old points too (for comparison; moves samples)",
+     fbm_weights_diamond, fbm_values_diamond, 1, 0, 1, RULE_ADDITIONS, true, false},
+    {.name = NULL},
 };
 
 const fbm_scheme *fbm_scheme_find(const char *name)
@@ -71,8 +77,8 @@ static size_t strip_size(size_t cells)
 
 size_t fbm_refine_scratch(size_t width)
 {
-    size_t cells = width / 2 + 1;
-    return ROWS * row_size(cells < STRIP ? cells : STRIP);
+    size_t cells = width / 2 + 1, rows = ROWS * row_size(cells < STRIP ? cells : STRIP);
+    return rows > fbm_classic_scratch() ? rows : fbm_classic_scratch();
 }
 
 typedef struct walk {
@@ -83,7 +89,6 @@ typedef struct walk {
     int64_t column; /* of the first cell of the strip */
     size_t count;   /* cells of the strip */
     bool noisy;
-    float centre_taps[3], edge_taps[3]; /* with the amplitude */
     /* Rings of rows, row j at [j & 3]; first columns relative to `column` in brackets. */
     float *centre[RING];       /* [-2], count + 3 */
     float *centre_noise[RING]; /* [-3], count + 5 */
@@ -110,17 +115,7 @@ static float *ring_row(float *const ring[RING], int64_t row)
 
 static void unit_noise(const walk *w, fbm_noise_kind kind, int64_t row, int64_t first, size_t count, float *out)
 {
-    const fbm_step *step = w->step;
-    int64_t period = step->period;
-    if (period == 0) {
-        w->kernel->noise(step->seed, step->level, kind, row, first, count, out);
-        return;
-    }
-    int64_t column = (first % period + period) % period;
-    for (size_t done = 0, n; done < count; done += n, column = 0) {
-        n = (uint64_t)(period - column) < count - done ? (size_t)(period - column) : count - done;
-        w->kernel->noise(step->seed, step->level, kind, row, column, n, out + done);
-    }
+    fbm_step_noise(w->kernel, w->step, w->step->period, kind, row, first, count, out);
 }
 
 /* Multiplies noise by the map at its vertices' means. */
@@ -155,10 +150,6 @@ static void start(walk *w, const fbm_kernel *kernel, const fbm_step *step, const
                   fbm_window from, float *scratch, size_t cells)
 {
     *w = (walk){.kernel = kernel, .step = step, .in = in, .map = map, .from = from, .noisy = step->amplitude != 0};
-    for (int k = 0; k < 3; k++) {
-        w->centre_taps[k] = step->amplitude * step->weights.centre_taps[k];
-        w->edge_taps[k] = step->amplitude * step->weights.edge_taps[k];
-    }
     size_t size = row_size(strip_size(cells));
     float **rows[] = {w->centre, w->centre_noise, w->row_noise, w->column_noise};
     for (int k = 0; k < 4; k++)
@@ -167,6 +158,19 @@ static void start(walk *w, const fbm_kernel *kernel, const fbm_step *step, const
     for (int k = 0; k < PARTIALS; k++, scratch += size)
         w->partial[k] = scratch;
     w->edge = scratch;
+}
+
+/* Weights of row j, or of what lies between it and the next. */
+static const fbm_weights *weights_at(const walk *w, int64_t j, bool between)
+{
+    const fbm_step *step = w->step;
+    return step->rows ? step->rows + (2 * j + between - step->first_row) : &step->weights;
+}
+
+static void scale_taps(const walk *w, const float taps[4], float *out)
+{
+    for (int k = 0; k < 4; k++)
+        out[k] = w->step->amplitude * taps[k];
 }
 
 /* ---- The 24-point stencil ---------------------------------------------------------------------- */
@@ -180,8 +184,9 @@ static void stencil_centres(const walk *w, int64_t i, int64_t j, size_t count, f
     if (w->noisy)
         for (int k = 0; k < 3; k++)
             job.g[k] = ring_row(w->centre_noise, j - 1 + k);
-    memcpy(job.w, w->step->weights.w, sizeof job.w);
-    memcpy(job.t, w->centre_taps, sizeof job.t);
+    const fbm_weights *weights = weights_at(w, j, true);
+    memcpy(job.w, weights->centre, sizeof job.w);
+    scale_taps(w, weights->centre_taps, job.t);
     memcpy(job.partial, w->partial, sizeof job.partial);
     w->kernel->centres(&job, count);
 }
@@ -202,10 +207,10 @@ static void next_edge_noise(const walk *w, int64_t j)
     make_noise(w, w->column_noise, FBM_NOISE_COLUMN_EDGES, j, w->column - 1, w->count + 3);
 }
 
-static void edge_job(const walk *w, fbm_edge_job *job)
+static void edge_job(const walk *w, const fbm_weights *weights, fbm_edge_job *job)
 {
-    memcpy(job->w, w->step->weights.w, sizeof job->w);
-    memcpy(job->t, w->edge_taps, sizeof job->t);
+    memcpy(job->w, weights->edge, sizeof job->w);
+    scale_taps(w, weights->edge_taps, job->t);
     memcpy(job->partial, w->partial, sizeof job->partial);
     job->out = w->edge;
 }
@@ -214,7 +219,7 @@ static void edge_job(const walk *w, fbm_edge_job *job)
 static void stencil_row_edges(const walk *w, int64_t j)
 {
     fbm_edge_job job = {.g = {NULL}};
-    edge_job(w, &job);
+    edge_job(w, weights_at(w, j, false), &job);
     for (int k = 0; k < 3; k++) {
         job.side[k] = input(w, w->column - 1, j - 1 + k);
         if (w->noisy)
@@ -231,7 +236,7 @@ static void stencil_row_edges(const walk *w, int64_t j)
 static void stencil_column_edges(const walk *w, int64_t j)
 {
     fbm_edge_job job = {.g = {NULL}};
-    edge_job(w, &job);
+    edge_job(w, weights_at(w, j, true), &job);
     for (int k = 0; k < 3; k++) {
         job.side[k] = ring_row(w->centre, j - 1 + k);
         if (w->noisy)
@@ -251,7 +256,8 @@ static void mean_centres(const walk *w, int64_t i, int64_t j, size_t count, floa
     float *noise = w->noisy ? w->partial[0] : NULL;
     if (noise)
         noise_row(w, FBM_NOISE_CENTRES, j, i, count, noise);
-    w->kernel->mean4(input(w, i, j), input(w, i, j + 1), noise, w->centre_taps[0], out, count);
+    float tap = w->step->amplitude * weights_at(w, j, true)->centre_taps[0];
+    w->kernel->mean4(input(w, i, j), input(w, i, j + 1), noise, tap, out, count);
 }
 
 static void mean_edges(const walk *w, fbm_noise_kind kind, int64_t j)
@@ -260,8 +266,11 @@ static void mean_edges(const walk *w, fbm_noise_kind kind, int64_t j)
     if (noise)
         noise_row(w, kind, j, w->column, w->count, noise);
     const float *ends = input(w, w->column, j);
-    const float *others = kind == FBM_NOISE_ROW_EDGES ? ends + 1 : input(w, w->column, j + 1);
-    w->kernel->mean2(ends, others, noise, w->edge_taps[0], w->edge, w->count);
+    bool along = kind == FBM_NOISE_ROW_EDGES;
+    const float *others = along ? ends + 1 : input(w, w->column, j + 1);
+    const fbm_weights *weights = weights_at(w, j, !along);
+    float tap = w->step->amplitude * (along ? weights->edge_taps[0] : weights->column_tap);
+    w->kernel->mean2(ends, others, noise, tap, w->edge, w->count);
 }
 
 /* ---- Schemes ----------------------------------------------------------------------------------- */
@@ -371,6 +380,11 @@ void fbm_refine_by(const fbm_kernel *kernel, const fbm_step *step, const float *
     if (!out_window.width || !out_window.height)
         return;
     require(contains(in_window, fbm_refine_support(step->scheme, out_window)) && out_window.stride >= out_window.width);
+    int rule = step->scheme->rule;
+    if (rule == RULE_CHILDREN || rule == RULE_ADDITIONS) {
+        fbm_classic_refine(kernel, step, rule == RULE_CHILDREN, in, map, in_window, out, out_window, scratch);
+        return;
+    }
     int64_t first = half(out_window.i), last = half(out_window.i + (int64_t)out_window.width - 1);
     size_t cells = (size_t)(last - first + 1), strip = strip_size(cells);
     walk w;
@@ -388,6 +402,11 @@ void fbm_centres_by(const fbm_kernel *kernel, const fbm_step *step, const float 
     if (!cells.width || !cells.height)
         return;
     require(contains(in_window, fbm_centres_support(step->scheme, cells)) && cells.stride >= cells.width);
+    require(!step->scheme->cells);
+    if (step->scheme->rule == RULE_ADDITIONS) {
+        fbm_successive_centres(kernel, step, in, map, in_window, out, cells, scratch);
+        return;
+    }
     walk w;
     start(&w, kernel, step, in, map, in_window, scratch, cells.width);
     size_t strip = strip_size(cells.width);

@@ -15,6 +15,8 @@ typedef enum fbm_noise_kind {
     FBM_NOISE_PLANE = 4,        /* slopes of its plane term */
     FBM_NOISE_VERTICES = 5,     /* (i, j): a vertex itself, as for simulated borders */
     FBM_NOISE_CELLS = 6,        /* (i, j): a child of a cell, as its mean */
+    FBM_NOISE_ROWS = 7,         /* (i, j): the sample (i, j + 1/2) of a row put between two; the level is -1 - step */
+    FBM_NOISE_ADDITIONS = 8,    /* (i, j): an old point of the finer lattice, moved by successive additions */
 } fbm_noise_kind;
 
 /* Writes the noise of columns first ... first + count - 1 of one row to out[count].

@@ -4,6 +4,7 @@
 
 #include <math.h>
 #include <stddef.h>
+#include <string.h>
 
 /* The tuned table, reference data of the project (weights24.csv): for each H the coefficients of the 24-point
  * predictor and of the 3 x 3 residual filter that bring the exactly propagated structure function of repeated
@@ -38,9 +39,6 @@ static const double table[KNOTS][1 + COLUMNS] = {
     {0.98, 0.334706053, -0.0465899479, -0.00648945231, 0.00748164745, 0.0898955377, -0.000632534236, -0.00419066415},
     {0.99, 0.335262625, -0.0471377709, -0.00589762418, 0.00745527055, 0.0632748394, -0.000501610883, -0.00305178856},
 };
-
-/* Samples in each orbit of the predictor. */
-static const double orbit[4] = {4, 8, 4, 8};
 
 double fbm_hurst_clamp(double hurst)
 {
@@ -109,59 +107,182 @@ static double interpolate(int column, double hurst)
     return column < 4 ? value : value * sqrt(1 - hurst);
 }
 
-/* ---- Schemes ----------------------------------------------------------------------------------- */
+/* ---- Rounding ---------------------------------------------------------------------------------- */
 
-/* Rounds the predictor to float such that its sum stays 1: what rounding the others costs goes to the orbit that weighs
- * least, whose own rounding is the smallest. Else every level would shift a plateau at 4,000 m by up to a millimetre.
- */
-static void round_predictor(const double *w, float *out)
+/* Points in each orbit of the predictors. */
+static const double centre_orbits[6] = {4, 4, 4, 4, 4, 4}, edge_orbits[8] = {2, 2, 4, 4, 2, 2, 4, 4};
+
+void fbm_round_predictor(const double *w, const double *orbits, size_t count, float *out)
 {
     size_t least = 0;
-    for (size_t k = 1; k < 4; k++)
+    for (size_t k = 1; k < count; k++)
         if (fabs(w[k]) < fabs(w[least]))
             least = k;
     double rest = 1;
-    for (size_t k = 0; k < 4; k++) {
+    for (size_t k = 0; k < count; k++) {
         out[k] = (float)w[k];
         if (k != least)
-            rest -= orbit[k] * (double)out[k];
+            rest -= orbits[k] * (double)out[k];
     }
-    out[least] = (float)(rest / orbit[least]);
+    out[least] = (float)(rest / orbits[least]);
 }
 
-void fbm_weights_stationary(double hurst, fbm_weights *out)
+static void round_taps(const double *values, size_t count, float *out)
+{
+    for (size_t k = 0; k < count; k++)
+        out[k] = (float)values[k];
+}
+
+void fbm_weights_round(const double values[FBM_WEIGHT_VALUES], fbm_weights *out)
+{
+    fbm_round_predictor(values, centre_orbits, 6, out->centre);
+    round_taps(values + 6, 4, out->centre_taps);
+    fbm_round_predictor(values + 10, edge_orbits, 8, out->edge);
+    round_taps(values + 18, 4, out->edge_taps);
+    out->column_tap = (float)values[22];
+}
+
+/* ---- Schemes ----------------------------------------------------------------------------------- */
+
+/* Coefficients of the square's symmetry {w0 ... w3; t0 ... t2} as those of the rectangle's; edges see the centres'
+ * picture turned by 45 degrees, where axes and diagonals change places. */
+static void spread(const double w[4], const double t[3], double turn, double *values)
+{
+    const double all[FBM_WEIGHT_VALUES] = {
+        w[0], w[1], w[1], w[2], w[3], w[3], t[0],        t[1],        t[1],        t[2],        w[0],       w[0],
+        w[1], w[1], w[2], w[2], w[3], w[3], turn * t[0], turn * t[1], turn * t[2], turn * t[2], turn * t[0]};
+    for (int k = 0; k < FBM_WEIGHT_VALUES; k++)
+        values[k] = all[k];
+}
+
+void fbm_values_table(double hurst, double values[FBM_WEIGHT_VALUES])
 {
     hurst = fbm_hurst_clamp(hurst);
-    double w[4], turn = fbm_exp2(-hurst / 2);
+    double w[4], t[3];
     for (int k = 0; k < 4; k++)
         w[k] = interpolate(k, hurst);
-    round_predictor(w, out->w);
-    for (int k = 0; k < 3; k++) {
-        double tap = interpolate(4 + k, hurst);
-        out->centre_taps[k] = (float)tap;
-        out->edge_taps[k] = (float)(tap * turn);
+    for (int k = 0; k < 3; k++)
+        t[k] = interpolate(4 + k, hurst);
+    spread(w, t, fbm_exp2(-hurst / 2), values);
+}
+
+/* Orbits of the square's symmetry keep their equality when they are rounded: what the others' rounding costs goes to
+ * the orbit that weighs least, whose own rounding is the smallest. Else every level would shift a plateau at 4,000 m by
+ * up to a millimetre. */
+void fbm_weights_stationary(double hurst, fbm_weights *out)
+{
+    static const double orbits[4] = {4, 8, 4, 8};
+    double values[FBM_WEIGHT_VALUES];
+    float w[4];
+    fbm_values_table(hurst, values);
+    fbm_round_predictor((const double[]){values[0], values[1], values[3], values[4]}, orbits, 4, w);
+    fbm_weights_round(values, out);
+    const float centre[6] = {w[0], w[1], w[1], w[2], w[3], w[3]};
+    const float edge[8] = {w[0], w[0], w[1], w[1], w[2], w[2], w[3], w[3]};
+    memcpy(out->centre, centre, sizeof centre);
+    memcpy(out->edge, edge, sizeof edge);
+}
+
+/* h^(2H) of a distance, by its square. */
+static double power(double x, double y, double hurst)
+{
+    return fbm_pow(x * x + y * y, hurst);
+}
+
+/* Standard deviation of fBm at 0 about the weighted mean of `count` points. */
+static double residual_of_mean(const double (*points)[2], const double *w, size_t count, double hurst)
+{
+    double variance = 0;
+    for (size_t i = 0; i < count; i++) {
+        variance += w[i] * power(points[i][0], points[i][1], hurst);
+        for (size_t j = 0; j < count; j++)
+            variance -= w[i] * w[j] / 2 * power(points[i][0] - points[j][0], points[i][1] - points[j][1], hurst);
     }
+    return sqrt(variance);
+}
+
+static const double quarters[4] = {.25, .25, .25, .25};
+
+static double corners_residual(double hurst, double aspect)
+{
+    double x = aspect / 2;
+    const double corners[4][2] = {{-x, -.5}, {x, -.5}, {-x, .5}, {x, .5}};
+    return residual_of_mean(corners, quarters, 4, hurst);
+}
+
+static void clear(double *values)
+{
+    for (int k = 0; k < FBM_WEIGHT_VALUES; k++)
+        values[k] = 0;
+    values[0] = .25;
+}
+
+void fbm_values_square(double hurst, double aspect, double values[FBM_WEIGHT_VALUES])
+{
+    hurst = fbm_hurst_clamp(hurst);
+    double edge = sqrt(fbm_exp2(-2 * hurst) - .25);
+    clear(values);
+    values[10] = .5; /* not used: see the kernels of means */
+    values[6] = corners_residual(hurst, aspect);
+    values[18] = edge * fbm_pow(aspect, hurst);
+    values[22] = edge;
+}
+
+void fbm_values_diamond(double hurst, double aspect, double values[FBM_WEIGHT_VALUES])
+{
+    hurst = fbm_hurst_clamp(hurst);
+    double x = aspect / 2;
+    const double ends[4][2] = {{-x, 0}, {x, 0}, {0, -.5}, {0, .5}};
+    clear(values);
+    values[10] = values[11] = .25;
+    values[6] = corners_residual(hurst, aspect);
+    values[18] = values[22] = residual_of_mean(ends, quarters, 4, hurst);
+}
+
+void fbm_values_children(double hurst, double aspect, double values[FBM_WEIGHT_VALUES])
+{
+    static const double w[4] = {9 / 16., 3 / 16., 3 / 16., 1 / 16.};
+    hurst = fbm_hurst_clamp(hurst);
+    double x = aspect / 4;
+    const double cells[4][2] = {{-x, -.25}, {3 * x, -.25}, {-x, .75}, {3 * x, .75}};
+    clear(values);
+    values[10] = .5;
+    values[6] = values[18] = values[22] = residual_of_mean(cells, w, 4, hurst);
 }
 
 void fbm_weights_square(double hurst, fbm_weights *out)
 {
     hurst = fbm_hurst_clamp(hurst);
     double grow = fbm_exp2(hurst);
-    *out = (fbm_weights){.w = {0.25F}};
+    *out = (fbm_weights){.centre = {0.25F}, .edge = {0.5F}};
     out->centre_taps[0] = (float)sqrt(1 / grow - 0.25 - grow / 8);
-    out->edge_taps[0] = (float)sqrt(1 / (grow * grow) - 0.25);
+    out->edge_taps[0] = out->column_tap = (float)sqrt(1 / (grow * grow) - 0.25);
 }
 
-static double residual(const float taps[3])
+void fbm_weights_diamond(double hurst, fbm_weights *out)
 {
-    double t0 = (double)taps[0], t1 = (double)taps[1], t2 = (double)taps[2];
-    return sqrt(t0 * t0 + 4 * t1 * t1 + 4 * t2 * t2);
+    double values[FBM_WEIGHT_VALUES];
+    fbm_values_diamond(hurst, 1, values);
+    fbm_weights_round(values, out);
+}
+
+void fbm_weights_children(double hurst, fbm_weights *out)
+{
+    double values[FBM_WEIGHT_VALUES];
+    fbm_values_children(hurst, 1, values);
+    fbm_weights_round(values, out);
 }
 
 void fbm_weights_residual(const fbm_weights *weights, double *centre, double *edge)
 {
+    static const double centre_counts[4] = {1, 2, 2, 4}, edge_counts[4] = {1, 4, 2, 2};
+    double sums[2] = {0};
+    for (int k = 0; k < 4; k++) {
+        sums[0] += centre_counts[k] * (double)weights->centre_taps[k] * (double)weights->centre_taps[k];
+        sums[1] += edge_counts[k] * (double)weights->edge_taps[k] * (double)weights->edge_taps[k];
+    }
     if (centre)
-        *centre = residual(weights->centre_taps);
+        *centre = sqrt(sums[0]);
     if (edge)
-        *edge = residual(weights->edge_taps);
+        *edge = sqrt(sums[1]);
 }

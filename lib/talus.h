@@ -570,15 +570,24 @@ TL_API tl_framework *tl_framework_from_pyramid(const tl_pyramid *pyramid, const 
 typedef struct tl_scheme {
     const char *name;    /* "stationary" */
     const char *summary; /* one line */
-    bool noise;          /* tl_noise_create has it too: it needs no elevation model */
+    bool noise;          /* tl_noise_create has it: it needs no elevation model */
+    bool field;          /* tl_field_create has it: it goes on from heights that are there */
 } tl_scheme;
 
 /* The schemes, ended by an entry whose name is NULL. */
 TL_API const tl_scheme *tl_schemes(void);
 
+/* What the samples of an elevation model stand for, as far as refinement goes; where they lie is not changed by it. */
+typedef enum tl_support {
+    TL_SUPPORT_RASTER = 0, /* what the raster's own type says */
+    TL_SUPPORT_AREA,       /* means over cells */
+    TL_SUPPORT_POINT,      /* heights at their positions */
+} tl_support;
+
 typedef struct tl_field_options {
     int levels; /* halvings of the DEM's spacing, 0 ... 30 */
-    /* A name of tl_schemes(); NULL: "terrain" where neither hurst nor delta is given, else "stationary". */
+    /* A name of tl_schemes() with `field`; NULL: "terrain" where neither hurst nor delta is given, else "stationary".
+     */
     const char *scheme;
     bool hurst_given, delta_given;
     double hurst; /* Hurst exponent of every level below the DEM, 0.01 ... 0.99; where not given, measured */
@@ -586,11 +595,14 @@ typedef struct tl_field_options {
                      in units of height, >= 0; where not given, measured from the DEM */
     uint64_t seed;
     const tl_run *run; /* for the measurement, which reads the DEM once */
+    tl_support support;
 } tl_field_options;
 
 /* The terrain below the DEM's samples: a source at level options->levels. A point raster of W x H samples
- * becomes (W-1) 2^l + 1 by (H-1) 2^l + 1, and every 2^l-th sample is the DEM's own. An area raster becomes
- * W 2^l by H 2^l cells on the same footprint. Voids stay voids. */
+ * becomes (W-1) 2^l + 1 by (H-1) 2^l + 1, and every 2^l-th sample is the DEM's own (but for the scheme "successive",
+ * which moves it). An area raster becomes W 2^l by H 2^l cells on the same footprint. Voids stay voids. Cells that are
+ * not square are followed, for geographic rasters from row to row; schemes of fBm refuse cells beyond 0.2 ... 5 times
+ * as wide as high. */
 TL_API tl_source *tl_field_create(const tl_source *dem, const tl_field_options *options, tl_error *error);
 
 typedef struct tl_restore_options {
@@ -627,6 +639,7 @@ typedef struct tl_noise_options {
     double delta; /* standard deviation of the height difference over one sample, >= 0 */
     uint64_t seed;
     const char *scheme; /* a name of tl_schemes() with `noise`; NULL: "stationary" */
+    double aspect;      /* width of a cell over its height, 0.2 ... 5; 0: 1. delta is over the height. */
 } tl_noise_options;
 
 /* A fractional Brownian surface of size x size samples at unit spacing: S(h) = delta^2 |h|^(2 hurst). */
@@ -757,10 +770,18 @@ typedef enum tl_compression {
     TL_COMPRESSION_PIZ,  /* EXR (wavelet) */
 } tl_compression;
 
+/* Coarser levels beside a grid, in the same file. */
+typedef enum tl_mip {
+    TL_MIP_NONE = 0,
+    TL_MIP_LATTICE, /* every second sample: each level's samples are the grid's own */
+    TL_MIP_BOX,     /* means of 2 x 2 samples, of those that are known */
+} tl_mip;
+
 typedef struct tl_write_options {
     bool overwrite; /* replace an existing file; else TL_ERROR_IO */
     bool validity;  /* of grids, not meshes: also write each sample's tl_validity, to NAME.validity.tif for NAME.exr */
     tl_compression compression;
+    tl_mip mip; /* EXR only: a mipmap down to one sample, its sizes rounded up. It is gathered in memory, a third of the grid */
     tl_frame frame;
     const tl_run *run;
 } tl_write_options;

@@ -129,12 +129,12 @@ static void unreasonableSizesAreRefused(void **state)
     float untouched = 42;
     static const size_t sizes[] = {0, FBM_EXACT_SIZE_MAX + 1, SIZE_MAX / 2, SIZE_MAX};
     for (size_t k = 0; k < sizeof sizes / sizeof *sizes; k++) {
-        assert_int_equal(fbm_exact_memory(sizes[k], 0.9), 0);
+        assert_int_equal(fbm_exact_memory(sizes[k], 1, 0.9), 0);
         assert_int_equal(fbm_exact(sizes[k], 0.9, 1, 1, &untouched), FBM_TOO_LARGE);
     }
     assert_true(untouched == 42);
     for (double hurst = 0.1; hurst < 1; hurst += 0.8) {
-        double square = 1025.0 * 1025, bytes = (double)fbm_exact_memory(1025, hurst);
+        double square = 1025.0 * 1025, bytes = (double)fbm_exact_memory(1025, 1, hurst);
         assert_true(bytes > 35 * square && bytes < 125 * square);
     }
 }

@@ -182,7 +182,7 @@ static void centresEqualTheOddSamples(void **state)
 {
     (void)state;
     for (const fbm_scheme *scheme = fbm_schemes; scheme->name; scheme++)
-        for (int k = 0; k < 12; k++) {
+        for (int k = 0; k < 12 && !scheme->cells; k++) {
             fbm_step step = make_step(scheme, 0.5, k % 3 ? 3 : 0);
             size_t width = k == 7 ? 5000 : 1 + arbitrary(40), height = 1 + arbitrary(30);
             fbm_window cells = {(int64_t)arbitrary(20) - 10, (int64_t)arbitrary(20) - 10, width, height, width + 3};
@@ -202,6 +202,8 @@ static void verticesKeepTheirHeights(void **state)
 {
     (void)state;
     for (const fbm_scheme *scheme = fbm_schemes; scheme->name; scheme++) {
+        if (scheme->moves)
+            continue;
         fbm_step step = make_step(scheme, 0.1, 500);
         fbm_window to = {-7, -4, 55, 41, 55}, from = fbm_refine_support(scheme, to);
         float *in = make_heights(from), *out = refine(best(), &step, in, from, to);
@@ -249,12 +251,13 @@ static void smoothRefinementKeepsPlanes(void **state)
                     in[n] = (float)(p[0] + p[1] * i + p[2] * j);
                     largest = fmax(largest, fabs((double)in[n]));
                 }
+                double shift = scheme->cells ? .5 : 0; /* children lie a quarter of a cell off their cell */
                 float *out = refine(best(), &step, in, from, to);
                 double bound = largest * (12 * 0x1p-24 * 2.2 + 2e-8) * (1 + 2.2);
                 for (int y = 0; y < 40; y++)
                     for (int x = 0; x < 40; x++)
                         assert_true(fabs((double)out[y * 40 + x] -
-                                         (p[0] + p[1] * (x - 11) / 2 + p[2] * (y - 10) / 2)) <= bound);
+                                         (p[0] + p[1] * (x - 11 - shift) / 2 + p[2] * (y - 10 - shift) / 2)) <= bound);
                 free(in), free(out);
             }
 }
@@ -294,7 +297,7 @@ static void otherSeedsAndLevelsGiveOtherNoise(void **state)
         for (int k = 1; k < 3; k++) {
             float *b = refine(best(), &steps[k], in, from, to);
             for (size_t n = 0; n < samples(to); n++)
-                assert_true((a[n] == b[n]) == (n % 41 % 2 == 0 && n / 41 % 2 == 0));
+                assert_true((a[n] == b[n]) == (!scheme->moves && n % 41 % 2 == 0 && n / 41 % 2 == 0));
             free(b);
         }
         free(in), free(a);
@@ -307,11 +310,13 @@ static void noiseIsKeyedByLatticeCoordinates(void **state)
     (void)state;
     const fbm_window to = {-6, 2, 700, 30, 700};
     for (const fbm_scheme *scheme = fbm_schemes; scheme->name; scheme++) {
+        if (scheme->moves)
+            continue;
         fbm_window from = fbm_refine_support(scheme, to);
         float *in = allocate(samples(from));
         memset(in, 0, samples(from) * sizeof *in);
         fbm_step step = {.scheme = scheme, .amplitude = 1, .seed = 31, .level = -2};
-        step.weights.centre_taps[0] = step.weights.edge_taps[0] = 1;
+        step.weights.centre_taps[0] = step.weights.edge_taps[0] = step.weights.column_tap = 1;
         float *out = refine(best(), &step, in, from, to);
         for (int j = 1; j < 16; j++) {
             float centres[350], rows[350], columns[350];
@@ -333,13 +338,15 @@ static void noiseHasTheStatedVariance(void **state)
     (void)state;
     enum { SIDE = 512 };
     for (const fbm_scheme *scheme = fbm_schemes; scheme->name; scheme++) {
+        if (scheme->moves)
+            continue;
         fbm_window to = {0, 0, SIDE, SIDE, SIDE}, from = fbm_refine_support(scheme, to);
         float *in = allocate(samples(from));
         memset(in, 0, samples(from) * sizeof *in);
         fbm_step step = make_step(scheme, 0.45, 2);
         double expected[2], sums[2] = {0}, error = sqrt(2 * 1.2 / (SIDE * SIDE / 4));
         fbm_weights_residual(&step.weights, &expected[0], &expected[1]);
-        memset(step.weights.w, 0, sizeof step.weights.w); /* so that edges do not see the centres' noise */
+        memset(step.weights.edge, 0, sizeof step.weights.edge); /* so that edges do not see the centres' noise */
         float *out = refine(best(), &step, in, from, to);
         for (int y = 0; y < SIDE; y++)
             for (int x = 0; x < SIDE; x++) {
@@ -374,6 +381,8 @@ static void voidsSpreadOverTheStencilOnly(void **state)
 {
     (void)state;
     for (const fbm_scheme *scheme = fbm_schemes; scheme->name; scheme++) {
+        if (scheme->cells)
+            continue;
         fbm_step step = make_step(scheme, 0.5, 1);
         fbm_window to = {-20, -20, 41, 41, 41}, from = fbm_refine_support(scheme, to);
         float *in = make_heights(from);

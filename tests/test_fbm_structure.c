@@ -58,6 +58,94 @@ static void squareShowsItsKnownDeviation(void **state)
     }
 }
 
+/* ---- cells that are not square ---- */
+
+static fbm_deviation stretched_deviation(double hurst, double aspect, int levels)
+{
+    int halvings = fbm_aspect_halvings(aspect);
+    fbm_row_weights rows[2];
+    fbm_weights weights;
+    double values[FBM_WEIGHT_VALUES];
+    for (int k = 0; k < halvings; k++) {
+        fbm_values_rows(hurst, ldexp(aspect, k), halvings == 2 && k == 0, values);
+        fbm_row_weights_round(values, &rows[k]);
+    }
+    fbm_values_stationary(hurst, ldexp(aspect, halvings), values);
+    fbm_weights_round(values, &weights);
+    fbm_refinement refinement = {fbm_schemes, hurst, aspect, &weights, halvings, rows};
+    fbm_deviation found;
+    assert_int_equal(fbm_refinement_deviation(&refinement, levels, halvings == 2 ? 1 : 2, &found), FBM_OK);
+    return found;
+}
+
+/* Exact, so there is no spread: 2 % for H >= 0.1, at any position and lag; 1 % at aspect 1. */
+static void stretchedCellsStayWithinTwoPercent(void **state)
+{
+    (void)state;
+    static const double hursts[] = {0.1, 0.2, 0.3, 0.5, 0.7, 0.8, 0.9, 0.97, 0.99};
+    for (size_t h = 0; h < sizeof hursts / sizeof *hursts; h++) {
+        for (double aspect = 0.25; aspect <= 1.35; aspect += 0.05)
+            assert_true(stretched_deviation(hursts[h], aspect, 2).point < .02);
+        assert_true(stretched_deviation(hursts[h], 1, 3).point < .01);
+    }
+    assert_true(stretched_deviation(.1, .708, 4).point < .02);
+    assert_true(stretched_deviation(.1, .36, 3).point < .02);
+    assert_true(stretched_deviation(.9, .26, 2).mean < .012);
+}
+
+/* Between five nodes of a table the quartic costs less than a tenth of a percent. */
+static void aspectsBetweenNodesAreAsGood(void **state)
+{
+    (void)state;
+    for (double hurst = .1; hurst < 1; hurst += .2) {
+        fbm_aspect_table table;
+        fbm_aspect_table_make(fbm_values_stationary, hurst, -.5, .5, &table);
+        for (double log_aspect = -.45; log_aspect < .5; log_aspect += .3) {
+            fbm_weights weights;
+            fbm_deviation found;
+            double aspect = pow(2, log_aspect), exact = stretched_deviation(hurst, aspect, 2).point;
+            fbm_aspect_table_at(&table, log_aspect, &weights);
+            if (aspect < .7072)
+                continue;
+            fbm_refinement refinement = {fbm_schemes, hurst, aspect, &weights, 0, NULL};
+            assert_int_equal(fbm_refinement_deviation(&refinement, 2, 2, &found), FBM_OK);
+            assert_true(found.point < exact + .001);
+        }
+    }
+}
+
+/* Ignoring the aspect must be seen. */
+static void stretchedCellsTakenForSquaresAreNoticed(void **state)
+{
+    (void)state;
+    fbm_weights weights;
+    fbm_deviation found;
+    fbm_weights_stationary(.5, &weights);
+    fbm_refinement refinement = {fbm_schemes, .5, .8, &weights, 0, NULL};
+    assert_int_equal(fbm_refinement_deviation(&refinement, 2, 2, &found), FBM_OK);
+    assert_true(found.point > .05);
+}
+
+/* What an independent analysis of the classical rules says in the rough (percent after the best scale, largest ratio of
+ * variances by position); other lags and windows, so within a factor of 2. */
+static void classicalSchemesShowTheirKnownDeviation(void **state)
+{
+    (void)state;
+    static const struct {
+        const char *name;
+        double hurst, scaled, ratio;
+    } known[] = {{"diamond-square", .1, 31, 2.3},
+                 {"diamond-square", .5, 21, 1.8},
+                 {"successive", .5, 22, 5.3},
+                 {"square-square", .3, 25, 1.3},
+                 {"square-square", .5, 52, 1.5}};
+    for (size_t k = 0; k < sizeof known / sizeof *known; k++) {
+        fbm_deviation found = deviation(known[k].name, known[k].hurst, 4, 1);
+        assert_true(100 * found.mean_scaled > known[k].scaled / 3 && 100 * found.mean_scaled < 2 * known[k].scaled);
+        assert_true(found.ratio > 1 + (known[k].ratio - 1) / 3 && found.ratio < 2 * known[k].ratio);
+    }
+}
+
 /* With one coefficient changed by 2 % the analysis notices. */
 static void wrongCoefficientsAreNoticed(void **state)
 {
@@ -72,8 +160,8 @@ static void wrongCoefficientsAreNoticed(void **state)
         else if (k == 1)
             weights.edge_taps[0] *= 1.02F;
         else {
-            weights.w[0] *= 1.02F;
-            weights.w[1] -= 0.01F * weights.w[0];
+            weights.edge[0] *= 1.02F;
+            weights.edge[2] -= 0.01F * weights.edge[0];
         }
         assert_int_equal(fbm_structure_deviation(scheme, &weights, 0.5, 3, 1, &found), FBM_OK);
         assert_true(found.point > 0.01);
@@ -166,6 +254,10 @@ int main(void)
         cmocka_unit_test(splineKeepsTheDeviationsBetweenKnots),
         cmocka_unit_test(squareShowsItsKnownDeviation),
         cmocka_unit_test(wrongCoefficientsAreNoticed),
+        cmocka_unit_test(stretchedCellsStayWithinTwoPercent),
+        cmocka_unit_test(aspectsBetweenNodesAreAsGood),
+        cmocka_unit_test(stretchedCellsTakenForSquaresAreNoticed),
+        cmocka_unit_test(classicalSchemesShowTheirKnownDeviation),
         cmocka_unit_test(sizesOutOfRangeAreRefused),
         cmocka_unit_test(sampledIncrementsHaveTheVarianceOfFbm),
     };

@@ -12,8 +12,13 @@
 
 static double predictor_sum(const fbm_weights *weights)
 {
-    const float *w = weights->w;
-    return 4 * (double)w[0] + 8 * (double)w[1] + 4 * (double)w[2] + 8 * (double)w[3];
+    static const double orbits[8] = {2, 2, 4, 4, 2, 2, 4, 4};
+    double centre = 0, edge = 0;
+    for (int k = 0; k < 6; k++)
+        centre += 4 * (double)weights->centre[k];
+    for (int k = 0; k < 8; k++)
+        edge += orbits[k] * (double)weights->edge[k];
+    return fabs(centre - 1) > fabs(edge - 1) ? centre : edge;
 }
 
 static void predictorSumsToOneAsRounded(void **state)
@@ -42,11 +47,15 @@ static void splineIsExactAtTheKnots(void **state)
     for (size_t r = 0; r < 3; r++) {
         fbm_weights weights;
         fbm_weights_stationary(rows[r][0], &weights);
-        for (int k = 0; k < 4; k++)
-            assert_true(fabs((double)weights.w[k] - rows[r][1 + k]) < 9 * 0x1p-26);
-        for (int k = 0; k < 3; k++) {
-            assert_true(weights.centre_taps[k] == (float)rows[r][5 + k]);
-            assert_true(weights.edge_taps[k] == (float)(rows[r][5 + k] * pow(2, -rows[r][0] / 2)));
+        static const int centre[6] = {0, 1, 1, 2, 3, 3}, edge[8] = {0, 0, 1, 1, 2, 2, 3, 3};
+        static const int centre_taps[4] = {0, 1, 1, 2}, edge_taps[4] = {0, 1, 2, 2};
+        for (int k = 0; k < 6; k++)
+            assert_true(fabs((double)weights.centre[k] - rows[r][1 + centre[k]]) < 9 * 0x1p-26);
+        for (int k = 0; k < 8; k++)
+            assert_true(fabs((double)weights.edge[k] - rows[r][1 + edge[k]]) < 9 * 0x1p-26);
+        for (int k = 0; k < 4; k++) {
+            assert_true(weights.centre_taps[k] == (float)rows[r][5 + centre_taps[k]]);
+            assert_true(weights.edge_taps[k] == (float)(rows[r][5 + edge_taps[k]] * pow(2, -rows[r][0] / 2)));
         }
     }
 }
@@ -81,7 +90,7 @@ static void splineEndsAreNotKnots(void **state)
     for (int k = 0; k < 5; k++) {
         fbm_weights weights;
         fbm_weights_stationary(0.01 + 0.005 * k, &weights);
-        difference += binomial[k] * (double)weights.w[3];
+        difference += binomial[k] * (double)weights.centre[4];
     }
     assert_true(fabs(difference) < 16 * 0x1p-29);
 }
@@ -115,6 +124,59 @@ static void squareHasTheVariancesOfTwoDimensionalKriging(void **state)
     }
 }
 
+/* Values of an independent computation, to the digits given. */
+static void stretchedWeightsHaveTheCheckValues(void **state)
+{
+    (void)state;
+    static const double expected[22] = {.276758,  .004227,  -.013642, -.010488, -.005399, -.001456, .499312,  .025974,
+                                        .000591,  -.005878, .339831,  .217564,  -.008238, -.003664, -.005240, -.015196,
+                                        -.002449, -.004129, .413449,  .008963,  -.005052, -.003386};
+    static const double rows[13] = {.313461, .122971, .007542, -.005326, -.018495, -.014136, -.008535,
+                                    .464936, .063982, .007755, -.010223, -.007530, -.003786};
+    double values[FBM_WEIGHT_VALUES], between[FBM_ROW_VALUES];
+    fbm_values_stationary(.5, .8, values);
+    for (int k = 0; k < 22; k++)
+        assert_true(fabs(values[k] - expected[k]) < 1.5e-6);
+    fbm_values_rows(.5, .5, false, between);
+    for (int k = 0; k < 13; k++)
+        assert_true(fabs(between[k] - rows[k]) < 1.5e-6);
+    assert_true(between[13] == 0);
+}
+
+/* At 1 / a the picture is that at a with rows and columns exchanged, in units a times as large. */
+static void stretchedWeightsTurn(void **state)
+{
+    (void)state;
+    static const int turned[22] = {0, 2, 1, 3, 5, 4, 6, 8, 7, 9, 11, 10, 13, 12, 15, 14, 17, 16, 18, 19, 21, 20};
+    for (double hurst = .1; hurst < 1; hurst += .2) {
+        double a[FBM_WEIGHT_VALUES], b[FBM_WEIGHT_VALUES], grow = pow(1.25, hurst);
+        fbm_values_stationary(hurst, .8, a);
+        fbm_values_stationary(hurst, 1.25, b);
+        for (int k = 0; k < 22; k++) {
+            bool tap = (k >= 6 && k < 10) || k >= 18;
+            assert_true(fabs(b[turned[k]] - (tap ? grow : 1) * a[k]) < 1e-9);
+        }
+    }
+}
+
+static void classicalVariancesAreThoseOfTwoDimensions(void **state)
+{
+    (void)state;
+    for (double hurst = 0.1; hurst < 1; hurst += 0.2) {
+        fbm_weights diamond, children;
+        fbm_weights_diamond(hurst, &diamond);
+        fbm_weights_children(hurst, &children);
+        double centre = pow(2, -hurst) - .25 - pow(2, hurst) / 8, at = (double)diamond.centre_taps[0],
+               edge = (double)diamond.edge_taps[0], child = (double)children.centre_taps[0];
+        assert_true(fabs(at * at - centre) < 1e-7);
+        assert_true(fabs(edge * edge - centre * pow(2, -hurst)) < 1e-7);
+        /* distances sqrt(1/8), sqrt(5/8) twice and sqrt(9/8); pairs of cells at 1 and sqrt 2 */
+        double known = 9 / 16. * pow(.125, hurst) + 6 / 16. * pow(.625, hurst) + pow(1.125, hurst) / 16 -
+                       (60 + 18 * pow(2, hurst)) / 256;
+        assert_true(fabs(child * child - known) < 1e-7);
+    }
+}
+
 static void schemesAreFoundByName(void **state)
 {
     (void)state;
@@ -134,6 +196,9 @@ int main(void)
         cmocka_unit_test(splineEndsAreNotKnots),
         cmocka_unit_test(hurstIsClamped),
         cmocka_unit_test(squareHasTheVariancesOfTwoDimensionalKriging),
+        cmocka_unit_test(stretchedWeightsHaveTheCheckValues),
+        cmocka_unit_test(stretchedWeightsTurn),
+        cmocka_unit_test(classicalVariancesAreThoseOfTwoDimensions),
         cmocka_unit_test(schemesAreFoundByName),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);

@@ -7,131 +7,317 @@
 #include <pthread.h>
 #include <string.h>
 
-/* windows[l]: what level l must hold so that the target can be made. */
-static void plan(const scene_chain *chain, const scene_chain_target *target, fbm_window *windows)
+enum { STAGES = SCENE_LEVEL_MAX + 3 };
+
+/* How a target is made: stages are the halvings of the rows, then the levels. windows[s]: what must be there before
+ * stage s; the last is what the stages make (or the cells, for centres). Where rows were halved, the target is every
+ * 2^halvings-th row of that, and centres of cells are samples of the next level. */
+typedef struct work {
+    const scene_chain *chain;
+    int stages;
+    bool centres;
+    fbm_window windows[STAGES + 1];
+    size_t step_x, step_y;    /* of the target in what is made */
+    float *level[2], *map[2]; /* before even and odd stages */
+    float *made;              /* NULL: it is made in its place */
+    float *scratch;
+    void *rows; /* weights that follow the rows */
+} work;
+
+static fbm_window transposed(fbm_window w)
 {
-    int level = target->level;
-    windows[level] = target->centres ? fbm_centres_support(chain->steps[level].scheme, target->window) : target->window;
-    for (; level > 0; level--)
-        windows[level - 1] = fbm_refine_support(chain->steps[level - 1].scheme, windows[level]);
+    return (fbm_window){w.j, w.i, w.height, w.width, w.height};
+}
+
+/* ---- Planning ---------------------------------------------------------------------------------- */
+
+/* The window that the last stage makes. */
+static fbm_window goal(const scene_chain *chain, const scene_chain_target *target, work *w)
+{
+    int halvings = chain->shape.halvings;
+    fbm_window g = chain->shape.turned ? transposed(target->window) : target->window;
+    w->stages = halvings + target->level;
+    w->centres = target->centres && halvings == 0;
+    w->step_x = 1;
+    w->step_y = (size_t)1 << halvings;
+    if (target->centres && halvings) { /* (i + 1/2, j + 1/2) is (2i + 1, 2j + 1) of the next level */
+        w->stages++;
+        w->step_x = 2;
+        w->step_y *= 2;
+        g.i = 2 * g.i + 1;
+        g.width = 2 * g.width - 1;
+    }
+    int64_t step = (int64_t)w->step_y;
+    g.j = g.j * step + (target->centres && halvings ? step / 2 : 0);
+    g.height = (g.height - 1) * w->step_y + 1;
+    return g;
+}
+
+static void plan(const scene_chain *chain, const scene_chain_target *target, work *w)
+{
+    assert(target->level >= 0 && target->level <= SCENE_LEVEL_MAX && target->window.width && target->window.height);
+    int halvings = chain->shape.halvings;
+    *w = (work){.chain = chain};
+    fbm_window g = goal(chain, target, w);
+    const fbm_step *steps = chain->steps;
+    w->windows[w->stages] = w->centres ? fbm_centres_support(steps[target->level].scheme, g) : g;
+    for (int s = w->stages; s > 0; s--)
+        w->windows[s - 1] = s > halvings ? fbm_refine_support(steps[s - 1 - halvings].scheme, w->windows[s])
+                                         : fbm_rows_support(w->windows[s]);
+}
+
+static fbm_window asked_for(const scene_chain *chain, fbm_window window)
+{
+    return chain->shape.turned ? transposed(window) : window;
 }
 
 fbm_window scene_chain_support(const scene_chain *chain, const scene_chain_target *target)
 {
-    fbm_window windows[SCENE_LEVEL_MAX + 1];
-    plan(chain, target, windows);
-    return windows[0];
+    work w;
+    plan(chain, target, &w);
+    fbm_window window = asked_for(chain, w.windows[0]);
+    window.stride = window.width;
+    return window;
 }
 
-typedef struct buffers {
-    float *level[2], *map[2]; /* of even and of odd levels */
-    float *scratch;
-} buffers;
-
-static void buffers_free(buffers *b)
+static void work_free(work *w)
 {
-    free(b->level[0]);
-    free(b->level[1]);
-    free(b->map[0]);
-    free(b->map[1]);
-    free(b->scratch);
+    for (int k = 0; k < 2; k++) {
+        free(w->level[k]);
+        free(w->map[k]);
+    }
+    free(w->made);
+    free(w->scratch);
+    free(w->rows);
+}
+
+static size_t larger(size_t a, size_t b)
+{
+    return a > b ? a : b;
 }
 
 /* Room for every window of the plan but the one that is written straight to the caller. */
-static bool buffers_allocate(buffers *b, const fbm_window *windows, const scene_chain_target *target, bool mapped)
+static bool allocate(work *w, bool in_place)
 {
-    size_t most[2] = {1, 1}, width = 1;
-    int kept = target->centres ? target->level : target->level - 1;
-    for (int l = 0; l <= target->level; l++) {
+    size_t most[2] = {1, 1}, width = 1, height = 1, last = 1;
+    for (int s = 0; s <= w->stages; s++) {
         size_t samples;
-        if (!tl_size_mul(windows[l].width, windows[l].height, &samples))
+        if (!tl_size_mul(w->windows[s].width, w->windows[s].height, &samples))
             return false;
-        if (l <= kept && samples > most[l & 1])
-            most[l & 1] = samples;
-        width = windows[l].width > width ? windows[l].width : width;
+        if (s < w->stages || w->centres)
+            most[s & 1] = larger(most[s & 1], samples);
+        else
+            last = samples;
+        width = larger(width, w->windows[s].width);
+        height = larger(height, w->windows[s].height);
+        w->windows[s].stride = s < w->stages || w->centres || !in_place ? w->windows[s].width : w->windows[s].stride;
     }
-    b->level[0] = tl_alloc(most[0], sizeof(float));
-    b->level[1] = tl_alloc(most[1], sizeof(float));
-    b->scratch = tl_alloc(fbm_refine_scratch(2 * width), sizeof(float));
-    for (int k = 0; k < 2 && mapped; k++) {
-        b->map[k] = tl_alloc(most[k], sizeof(float));
-        if (!b->map[k])
-            return false;
+    bool good = true;
+    for (int k = 0; k < 2; k++) {
+        w->level[k] = tl_alloc(most[k], sizeof(float));
+        w->map[k] = w->chain->mapped ? tl_alloc(most[k], sizeof(float)) : NULL;
+        good = good && w->level[k] && (w->map[k] || !w->chain->mapped);
     }
-    return b->level[0] && b->level[1] && b->scratch;
+    size_t scratch = larger(fbm_refine_scratch(2 * width), fbm_rows_scratch(width));
+    w->scratch = tl_alloc(scratch, sizeof(float));
+    w->made = in_place ? NULL : tl_alloc(last, sizeof(float));
+    w->rows = w->chain->tables ? tl_alloc(2 * height + 8, sizeof(fbm_weights)) : NULL;
+    return good && w->scratch && (w->made || in_place) && (w->rows || !w->chain->tables);
 }
 
-static void copy_rows(const float *from, fbm_window window, float *to)
+/* ---- Weights that follow the rows -------------------------------------------------------------- */
+
+/* log2 of the aspect at a place, in rows of level 0; beyond the raster that of its rim. */
+static double log_aspect(const scene_shape *shape, double row)
 {
-    for (size_t row = 0; row < window.height; row++)
-        memcpy(to + row * window.stride, from + row * window.width, window.width * sizeof *to);
+    if (!(row > 0))
+        return shape->log_aspects[0];
+    if (row >= (double)(shape->rows - 1))
+        return shape->log_aspects[shape->rows - 1];
+    int64_t at = (int64_t)row;
+    double part = row - (double)at;
+    return (1 - part) * shape->log_aspects[at] + part * shape->log_aspects[at + 1];
 }
 
-/* The map of the next level, bilinear between the vertices of this one. */
-static void refine_map(const buffers *b, int level, const fbm_window *windows)
+/* Half a row before stage s, in rows of level 0. */
+static double half_row(int stage)
 {
+    return 1 / (double)((int64_t)2 << stage);
+}
+
+static fbm_step step_at(work *w, int stage)
+{
+    const scene_chain *c = w->chain;
+    fbm_step step = c->steps[stage - c->shape.halvings];
+    if (!c->tables)
+        return step;
+    fbm_window from = w->windows[stage];
+    fbm_weights *rows = w->rows;
+    double unit = half_row(stage);
+    step.first_row = 2 * from.j - 2;
+    for (size_t k = 0; k < 2 * from.height + 4; k++) {
+        double place = (double)(step.first_row + (int64_t)k) * unit;
+        fbm_aspect_table_at(&c->tables[stage - c->shape.halvings], log_aspect(&c->shape, place), &rows[k]);
+    }
+    step.rows = rows;
+    return step;
+}
+
+static fbm_row_step row_step_at(work *w, int stage)
+{
+    const scene_chain *c = w->chain;
+    fbm_row_step step = c->row_steps[stage];
+    if (!c->row_tables)
+        return step;
+    fbm_row_weights *rows = w->rows;
+    step.first_row = w->windows[stage].j;
+    for (size_t k = 0; k < w->windows[stage].height; k++) {
+        double place = (double)(2 * (step.first_row + (int64_t)k) + 1) * half_row(stage);
+        fbm_row_table_at(&c->row_tables[stage], log_aspect(&c->shape, place), &rows[k]);
+    }
+    step.rows = rows;
+    return step;
+}
+
+/* ---- Refining ---------------------------------------------------------------------------------- */
+
+/* The map of the next stage, bilinear between the vertices of this one: means, without noise. */
+static void refine_map(work *w, int stage)
+{
+    const float *map = w->map[stage & 1];
+    float *out = w->map[(stage + 1) & 1];
+    if (stage < w->chain->shape.halvings) {
+        fbm_row_step means = {.weights = {.w = {.5F}}};
+        fbm_refine_rows(&means, map, NULL, w->windows[stage], out, w->windows[stage + 1], w->scratch);
+        return;
+    }
     fbm_step means = {.scheme = fbm_scheme_find("square")};
     means.scheme->weights(.5, &means.weights);
-    fbm_refine(&means, b->map[level & 1], windows[level], b->map[(level + 1) & 1], windows[level + 1], b->scratch);
+    fbm_refine(&means, map, w->windows[stage], out, w->windows[stage + 1], w->scratch);
 }
 
-static void refine_all(const scene_chain *chain, const scene_chain_target *target, const fbm_window *windows,
-                       buffers *b)
+static void run_stage(work *w, int stage, float *out)
 {
-    int whole_levels = target->centres ? target->level : target->level - 1; /* levels made into buffers */
-    for (int l = 0; l < whole_levels; l++) {
-        fbm_refine_mapped(&chain->steps[l], b->level[l & 1], b->map[l & 1], windows[l], b->level[(l + 1) & 1],
-                          windows[l + 1], b->scratch);
-        if (chain->mapped)
-            refine_map(b, l, windows);
+    const float *in = w->level[stage & 1], *map = w->map[stage & 1];
+    if (stage < w->chain->shape.halvings) {
+        fbm_row_step step = row_step_at(w, stage);
+        fbm_refine_rows(&step, in, map, w->windows[stage], out, w->windows[stage + 1], w->scratch);
+    } else {
+        fbm_step step = step_at(w, stage);
+        fbm_refine_mapped(&step, in, map, w->windows[stage], out, w->windows[stage + 1], w->scratch);
     }
-    if (target->centres)
-        fbm_centres_mapped(&chain->steps[target->level], b->level[target->level & 1], b->map[target->level & 1],
-                           windows[target->level], target->out, target->window, b->scratch);
-    else if (target->level > 0)
-        fbm_refine_mapped(&chain->steps[whole_levels], b->level[whole_levels & 1], b->map[whole_levels & 1],
-                          windows[whole_levels], target->out, target->window, b->scratch);
-    else
-        copy_rows(b->level[0], target->window, target->out);
+}
+
+/* Makes `out`, of the last window; for centres, of the window `cells`. */
+static void refine_all(work *w, float *out, fbm_window cells)
+{
+    for (int s = 0; s < w->stages; s++) {
+        bool last = s + 1 == w->stages && !w->centres;
+        run_stage(w, s, last ? out : w->level[(s + 1) & 1]);
+        if (w->chain->mapped && !last)
+            refine_map(w, s);
+    }
+    if (w->centres) {
+        fbm_step step = step_at(w, w->stages);
+        fbm_centres_mapped(&step, w->level[w->stages & 1], w->map[w->stages & 1], w->windows[w->stages], out, cells,
+                           w->scratch);
+    }
+}
+
+/* Takes the target's samples out of what was made, turned back if it was turned. */
+static void pick(const work *w, const scene_chain_target *target)
+{
+    size_t stride = w->windows[w->stages].width;
+    bool turned = w->chain->shape.turned;
+    for (size_t y = 0; y < target->window.height; y++)
+        for (size_t x = 0; x < target->window.width; x++) {
+            size_t i = turned ? y : x, j = turned ? x : y;
+            target->out[y * target->window.stride + x] = w->made[j * w->step_y * stride + i * w->step_x];
+        }
+}
+
+static void transpose(const float *in, size_t width, size_t height, float *out)
+{
+    for (size_t y = 0; y < height; y++)
+        for (size_t x = 0; x < width; x++)
+            out[x * height + y] = in[y * width + x];
+}
+
+static tl_status load_turned(work *w, scene_chain_load load, void *context, const char *name, tl_error *error)
+{
+    fbm_window window = asked_for(w->chain, w->windows[0]);
+    size_t count = window.width * window.height;
+    float *heights = tl_alloc(count, sizeof *heights), *map = w->chain->mapped ? tl_alloc(count, sizeof *map) : NULL;
+    tl_status status = heights && (map || !w->chain->mapped) ? load(context, window, heights, map, error)
+                                                             : tl_fail_memory(error, name);
+    if (status == TL_OK)
+        transpose(heights, window.width, window.height, w->level[0]);
+    if (status == TL_OK && map)
+        transpose(map, window.width, window.height, w->map[0]);
+    free(heights);
+    free(map);
+    return status;
+}
+
+/* Centres of turned cells go to a buffer, too: the window is then that of the cells. */
+static tl_status run_turned_centres(work *w, const scene_chain_target *target, const char *name, tl_error *error)
+{
+    fbm_window cells = transposed(target->window);
+    float *made = tl_alloc_grid((int64_t)cells.width, (int64_t)cells.height, sizeof *made);
+    if (!made)
+        return tl_fail_memory(error, name);
+    refine_all(w, made, cells);
+    for (size_t y = 0; y < target->window.height; y++)
+        for (size_t x = 0; x < target->window.width; x++)
+            target->out[y * target->window.stride + x] = made[x * cells.width + y];
+    free(made);
+    return TL_OK;
 }
 
 tl_status scene_chain_run(const scene_chain *chain, const scene_chain_target *target, scene_chain_load load,
                           void *context, const char *name, tl_error *error)
 {
-    assert(target->level >= 0 && target->level <= SCENE_LEVEL_MAX);
-    fbm_window windows[SCENE_LEVEL_MAX + 1];
-    plan(chain, target, windows);
-    buffers b = {0};
-    tl_status status = TL_OK;
-    if (target->level == 0 && !target->centres)
-        windows[0].stride = windows[0].width; /* the buffer is dense; refined windows already are */
-    if (!buffers_allocate(&b, windows, target, chain->mapped))
-        status = tl_fail_memory(error, name);
-    /* level 0 that goes to the caller still needs a buffer of its own */
-    if (status == TL_OK && target->level == 0 && !target->centres) {
-        free(b.level[0]);
-        b.level[0] = tl_alloc_grid((int64_t)windows[0].width, (int64_t)windows[0].height, sizeof(float));
-        free(b.map[0]);
-        b.map[0] =
-            chain->mapped ? tl_alloc_grid((int64_t)windows[0].width, (int64_t)windows[0].height, sizeof(float)) : NULL;
-        if (!b.level[0] || (chain->mapped && !b.map[0]))
-            status = tl_fail_memory(error, name);
+    work w;
+    plan(chain, target, &w);
+    bool turned = chain->shape.turned;
+    bool in_place = w.centres || (w.step_y == 1 && !turned && w.stages > 0);
+    tl_status status = allocate(&w, in_place) ? TL_OK : tl_fail_memory(error, name);
+    if (status == TL_OK && w.stages == 0 && !w.centres) { /* level 0: what is loaded is what is made */
+        free(w.level[0]);
+        w.level[0] = w.made;
+        free(w.map[0]);
+        w.map[0] = chain->mapped ? tl_alloc(w.windows[0].width, w.windows[0].height * sizeof(float)) : NULL;
+        status = chain->mapped && !w.map[0] ? tl_fail_memory(error, name) : TL_OK;
     }
     if (status == TL_OK)
-        status = load(context, windows[0], b.level[0], b.map[0], error);
-    if (status == TL_OK)
-        refine_all(chain, target, windows, &b);
-    buffers_free(&b);
+        status = turned ? load_turned(&w, load, context, name, error)
+                        : load(context, w.windows[0], w.level[0], w.map[0], error);
+    if (status == TL_OK && w.centres && turned)
+        status = run_turned_centres(&w, target, name, error);
+    else if (status == TL_OK)
+        refine_all(&w, in_place ? target->out : w.made, target->window);
+    if (status == TL_OK && !in_place)
+        pick(&w, target);
+    if (w.level[0] == w.made)
+        w.made = NULL;
+    work_free(&w);
     return status;
 }
 
 const fbm_scheme *scene_scheme(const char *name, tl_error *error)
 {
+    if (name && !strcmp(name, SCENE_EXACT)) {
+        tl_fail(error, TL_ERROR_ARGUMENT,
+                "scheme 'exact': makes whole surfaces, which do not go on from an elevation model; take 'stationary'");
+        return NULL;
+    }
     const fbm_scheme *scheme = name ? fbm_scheme_find(name) : &fbm_schemes[0];
     if (!scheme)
         tl_fail(error, TL_ERROR_ARGUMENT, "scheme '%s': there is none of this name", name);
     return scheme;
 }
+
+static const char exact_summary[] = "Stein's exact generator, whole and in memory: the reference";
 
 enum { SCHEMES_MAX = 16 };
 
@@ -139,11 +325,15 @@ static tl_scheme schemes[SCHEMES_MAX];
 
 static void list_schemes(void)
 {
-    schemes[0] = (tl_scheme){.name = SCENE_TERRAIN, .summary = "detail shaped by the place, as real terrain has it"};
+    schemes[0] = (tl_scheme){
+        .name = SCENE_TERRAIN, .summary = "detail shaped by the place, as real terrain has it", .field = true};
+    size_t count = 1;
     for (size_t i = 0; fbm_schemes[i].name; i++) {
-        assert(i + 2 < SCHEMES_MAX);
-        schemes[i + 1] = (tl_scheme){.name = fbm_schemes[i].name, .summary = fbm_schemes[i].summary, .noise = true};
+        assert(count + 2 < SCHEMES_MAX);
+        schemes[count++] =
+            (tl_scheme){.name = fbm_schemes[i].name, .summary = fbm_schemes[i].summary, .noise = true, .field = true};
     }
+    schemes[count] = (tl_scheme){.name = SCENE_EXACT, .summary = exact_summary, .noise = true};
 }
 
 const tl_scheme *tl_schemes(void)

@@ -20,6 +20,7 @@ enum {
     /* Cells beyond the known samples that are made up so that the predictor has something to see. The output lies at
      * most half a cell outside of a known sample, and the halo of the refinement converges to 8 cells. */
     GROWTH = 10,
+    ROW_GROWTH = 3, /* and so many more for every halving of the rows */
 };
 
 typedef struct field {
@@ -31,6 +32,12 @@ typedef struct field {
     float trend;            /* how far a slope goes on beyond the rim: see scene_growth */
     tl_parameter *parameters;
 } field;
+
+/* Whether samples stand for cells: the raster's own type, or what is said of it. */
+static bool is_area(const field *f)
+{
+    return f->source.info.type == TL_RASTER_AREA;
+}
 
 /* ---- voids ---- */
 
@@ -74,7 +81,8 @@ static tl_status load(void *context, fbm_window window, float *buffer, float *ma
 static tl_status ground_read(const field *f, fbm_window window, ground *g, tl_error *error)
 {
     const char *name = f->dem->info.name;
-    scene_growth growth = {.rings = GROWTH, .trend = f->trend};
+    int rings = GROWTH + ROW_GROWTH * f->chain.shape.halvings;
+    scene_growth growth = {.rings = rings, .trend = f->trend};
     *g = (ground){.strengths = NULL};
     if (!f->chain.mapped)
         return scene_patch_read(f->dem, growth, window, &g->patch, error);
@@ -97,7 +105,7 @@ static void ground_free(ground *g)
  * centre at (k + 1/2) / 2^l - 1/2 samples, which is that of cell k - 2^(l-1) of the lattice of level l. */
 static scene_chain_target target_of(const field *f, int level, tl_window window, float *out, int64_t stride)
 {
-    bool centres = f->source.info.type == TL_RASTER_AREA && level > 0;
+    bool centres = is_area(f) && level > 0 && !f->chain.steps[0].scheme->cells; /* which go from cells to cells */
     int64_t shift = centres ? (int64_t)1 << (level - 1) : 0;
     return (scene_chain_target){
         .level = level,
@@ -131,7 +139,7 @@ static tl_status read_block(const field *f, int level, tl_window window, float *
     if (status == TL_OK)
         status = scene_chain_run(&f->chain, &target, load, &g, f->source.info.name, error);
     if (status == TL_OK && g.patch.known)
-        cut_voids(&g.patch, f->source.info.type == TL_RASTER_AREA, level, window, out, stride);
+        cut_voids(&g.patch, is_area(f), level, window, out, stride);
     ground_free(&g);
     return status;
 }
@@ -169,7 +177,7 @@ static tl_status field_validity(const tl_source *self, int level, tl_window wind
     const field *f = (const field *)self;
     if (window.width == 0 || window.height == 0)
         return TL_OK;
-    int64_t mask = self->info.type == TL_RASTER_AREA ? 0 : ((int64_t)1 << level) - 1;
+    int64_t mask = is_area(f) ? 0 : ((int64_t)1 << level) - 1;
     tl_window g = {window.x >> level, window.y >> level, 0, 0};
     g.width = ((window.x + window.width - 1 + mask) >> level) + 1 - g.x;
     g.height = ((window.y + window.height - 1 + mask) >> level) + 1 - g.y;
@@ -195,8 +203,8 @@ static tl_status field_size(const tl_source *self, int level, int64_t *width, in
     const field *f = (const field *)self;
     if (level < 0)
         return tl_fail(error, TL_ERROR_ARGUMENT, "%s: has no level %d", self->info.name, level);
-    *width = refined_size(f->dem->info.width, level, self->info.type);
-    *height = refined_size(f->dem->info.height, level, self->info.type);
+    *width = refined_size(f->dem->info.width, level, f->source.info.type);
+    *height = refined_size(f->dem->info.height, level, f->source.info.type);
     return TL_OK;
 }
 
@@ -206,10 +214,17 @@ static void field_destroy(tl_source *self)
     tl_crs_release(self->info.georef.crs);
     free(f->parameters);
     free(f->terrain);
+    scene_chain_finish(&f->chain);
     free(f);
 }
 
 /* ---- making ---- */
+
+static tl_status too_large(const tl_source *dem, int levels, tl_error *error)
+{
+    return tl_fail(error, TL_ERROR_ARGUMENT, "%s: %lld x %lld samples cannot be refined by %d levels; take fewer",
+                   dem->info.name, (long long)dem->info.width, (long long)dem->info.height, levels);
+}
 
 static tl_status check(const tl_source *dem, const tl_field_options *o, tl_error *error)
 {
@@ -222,8 +237,7 @@ static tl_status check(const tl_source *dem, const tl_field_options *o, tl_error
         return tl_fail(error, TL_ERROR_ARGUMENT, "delta must be from 0 to 1e30, not %g", o->delta);
     int64_t limit = INT64_C(1) << 60; /* coordinates of every level, and of the halo, must fit */
     if (info->level != 0 || info->width > limit >> o->levels || info->height > limit >> o->levels)
-        return tl_fail(error, TL_ERROR_ARGUMENT, "%s: %lld x %lld samples cannot be refined by %d levels; take fewer",
-                       info->name, (long long)info->width, (long long)info->height, o->levels);
+        return too_large(dem, o->levels, error);
     return TL_OK;
 }
 
@@ -232,7 +246,7 @@ static tl_status check(const tl_source *dem, const tl_field_options *o, tl_error
 static void schedule(const field *f, const tl_field_options *o, const tl_roughness *measured, scene_octave *octaves)
 {
     scene_predict_octaves(measured, &f->dem->info.georef, octaves, SCENE_LEVEL_MAX + 1);
-    bool area = f->dem->info.type == TL_RASTER_AREA;
+    bool area = is_area(f);
     double amplitude = o->delta;
     for (int l = 0; l <= SCENE_LEVEL_MAX; l++) {
         double hurst = o->hurst_given ? o->hurst : octaves[l].hurst;
@@ -247,18 +261,28 @@ static void schedule(const field *f, const tl_field_options *o, const tl_roughne
 
 /* Amplitude of the residual filter at each level, and the exponent for its weights: a measured octave of variance
  * sigma^2 is that of fBm whose delta makes it so, at an exponent below 1. */
-static void set_steps(field *f, const tl_field_options *o, const scene_octave *octaves)
+static tl_status set_steps(field *f, const tl_field_options *o, const scene_octave *octaves, tl_error *error)
 {
-    bool area = f->dem->info.type == TL_RASTER_AREA;
+    double hursts[SCENE_LEVEL_MAX + 1];
+    bool area = is_area(f);
     for (int l = 0; l <= SCENE_LEVEL_MAX && l <= o->levels; l++) {
         double model = fmin(fmax(octaves[l].hurst, FBM_HURST_MIN), FBM_HURST_MAX);
         fbm_step *step = &f->chain.steps[l];
-        step->scheme->weights(model, &step->weights);
+        hursts[l] = model;
         step->amplitude = (float)(octaves[l].sigma / sqrt(fbm_detail_of_fbm(model, area)));
         step->period = f->dem->info.wraps ? f->dem->info.width << l : 0;
         if (l == 0)
             f->trend = (float)(fbm_exp2(2 * model - 1) - 1);
     }
+    bool terrain = !strcmp(f->scheme, SCENE_TERRAIN);
+    if (terrain && area)
+        return TL_OK; /* not by the chain */
+    tl_status status = scene_chain_fit(&f->chain, &f->dem->info, hursts, o->levels, !terrain, error);
+    int64_t limit = INT64_C(1) << (58 - f->chain.shape.halvings); /* there are so many rows more, and centres */
+    if (status == TL_OK && f->chain.shape.halvings &&
+        (f->dem->info.height > limit >> o->levels || f->dem->info.width > limit >> o->levels))
+        return too_large(f->dem, o->levels, error);
+    return status;
 }
 
 /* The record: pairs of name and value. */
@@ -290,14 +314,14 @@ static void place(field *f, int levels)
     tl_source_info *info = &f->source.info;
     const tl_source_info *dem = &f->dem->info;
     double scale = ldexp(1, -levels);
-    info->width = refined_size(dem->width, levels, dem->type);
-    info->height = refined_size(dem->height, levels, dem->type);
+    info->width = refined_size(dem->width, levels, info->type);
+    info->height = refined_size(dem->height, levels, info->type);
     info->level = levels;
     info->quantum = levels ? 0 : dem->quantum;
-    info->block_width = info->block_height = 0;                           /* whatever window is wanted is made */
-    info->wraps = dem->wraps && (dem->type == TL_RASTER_AREA || !levels); /* points end a cell before the first */
+    info->block_width = info->block_height = 0;          /* whatever window is wanted is made */
+    info->wraps = dem->wraps && (is_area(f) || !levels); /* points end a cell before the first */
     double *t = info->georef.transform;
-    if (dem->type == TL_RASTER_AREA) { /* the first cell's centre moves towards the corner */
+    if (is_area(f)) { /* the first cell's centre moves towards the corner */
         double shift = 0.5 * scale - 0.5;
         t[0] += shift * (t[1] + t[2]);
         t[3] += shift * (t[4] + t[5]);
@@ -315,6 +339,10 @@ static tl_status prepare(field *f, const tl_field_options *o, tl_error *error)
     if (!scheme)
         return TL_ERROR_ARGUMENT;
     f->scheme = terrain ? SCENE_TERRAIN : scheme->name;
+    if (scheme->cells && !is_area(f))
+        return tl_fail(error, TL_ERROR_ARGUMENT,
+                       "%s: scheme '%s' refines cells, and these are points; take --support area, or another scheme",
+                       f->dem->info.name, scheme->name);
     for (int l = 0; l <= SCENE_LEVEL_MAX; l++)
         f->chain.steps[l] = (fbm_step){.scheme = scheme, .seed = o->seed, .level = l};
     scene_detail detail = {.noise = 0};
@@ -326,16 +354,18 @@ static tl_status prepare(field *f, const tl_field_options *o, tl_error *error)
     tl_roughness measured = scene_roughness_of(&detail, &f->dem->info.georef);
     scene_octave octaves[SCENE_LEVEL_MAX + 1];
     schedule(f, o, &measured, octaves);
-    set_steps(f, o, octaves);
+    status = set_steps(f, o, octaves, error);
+    if (status != TL_OK)
+        return status;
     place(f, o->levels);
     if (terrain && o->levels > 0) {
         f->terrain = malloc(sizeof *f->terrain);
         if (!f->terrain)
             return tl_fail_memory(error, f->dem->info.name);
-        f->chain.mapped = f->dem->info.type == TL_RASTER_POINT; /* its samples stay: the lattice is refined */
-        status = f->chain.mapped
-                     ? scene_terrain_measure_strengths(f->dem, &detail, octaves, o->run, f->terrain, error)
-                     : scene_terrain_measure(f->dem, &detail, octaves, o->levels, o->seed, 0, o->run, f->terrain, error);
+        f->chain.mapped = !is_area(f); /* its samples stay: the lattice is refined */
+        status = f->chain.mapped ? scene_terrain_measure_strengths(f->dem, &detail, octaves, o->run, f->terrain, error)
+                                 : scene_terrain_measure(f->dem, &detail, octaves, o->levels, o->seed, 0, o->run,
+                                                         f->terrain, error);
     }
     return status == TL_OK ? note_all(f, o, &measured, error) : status;
 }
@@ -356,6 +386,8 @@ tl_source *tl_field_create(const tl_source *dem, const tl_field_options *options
                             .size = field_size,
                             .validity = field_validity,
                             .destroy = field_destroy};
+    if (o->support != TL_SUPPORT_RASTER)
+        f->source.info.type = o->support == TL_SUPPORT_AREA ? TL_RASTER_AREA : TL_RASTER_POINT;
     f->source.info.parameter_count = 0; /* the record is its own */
     f->source.info.parameters = NULL;
     f->dem = dem;

@@ -11,18 +11,20 @@
 #include <math.h>
 #include <stdio.h>
 #include <string.h>
+#include <unistd.h>
 
 enum {
     COARSE_CELLS = 256, /* cells on a side of the exact field, at most */
     HALO = 8,           /* coarse samples beyond it that refinement can see; converges to this (see chain) */
+    ROW_HALO = 3,       /* and so many more for every halving of the rows */
     BLOCK = 512,
 };
 
 typedef struct noise {
     tl_source source;
     scene_chain chain;
-    int levels;   /* refinements of the exact field */
-    int64_t side; /* of the exact field, halo included */
+    int levels;         /* refinements of the exact field */
+    int64_t side, halo; /* of the exact field, halo included; samples of the halo */
     float *exact;
     tl_parameter *parameters;
 } noise;
@@ -32,7 +34,7 @@ static tl_status load(void *context, fbm_window window, float *buffer, float *ma
     (void)map;
     (void)error;
     const noise *n = context;
-    int64_t i = window.i + HALO, j = window.j + HALO;
+    int64_t i = window.i + n->halo, j = window.j + n->halo;
     assert(i >= 0 && j >= 0 && i + (int64_t)window.width <= n->side && j + (int64_t)window.height <= n->side);
     for (size_t row = 0; row < window.height; row++)
         memcpy(buffer + row * window.width, n->exact + (j + (int64_t)row) * n->side + i, window.width * sizeof *buffer);
@@ -73,38 +75,76 @@ static tl_status check(const tl_noise_options *o, tl_error *error)
         return tl_fail(error, TL_ERROR_ARGUMENT, "the Hurst exponent must be from 0.01 to 0.99, not %g", o->hurst);
     if (!(o->delta >= 0 && o->delta <= 1e30))
         return tl_fail(error, TL_ERROR_ARGUMENT, "delta must be from 0 to 1e30, not %g", o->delta);
+    if (o->aspect != 0 && !(o->aspect >= FBM_ASPECT_MIN && o->aspect <= 1 / FBM_ASPECT_MIN))
+        return tl_fail(error, TL_ERROR_ARGUMENT, "the aspect must be from 0.2 to 5, not %g", o->aspect);
     return TL_OK;
+}
+
+/* Bytes of the machine; 0 where it does not tell. */
+static double physical_memory(void)
+{
+#ifdef _SC_PHYS_PAGES
+    return (double)sysconf(_SC_PHYS_PAGES) * (double)sysconf(_SC_PAGESIZE);
+#else
+    return 0;
+#endif
 }
 
 static tl_status make_exact(noise *n, const tl_noise_options *o, tl_error *error)
 {
-    n->exact = tl_alloc_grid(n->side, n->side, sizeof *n->exact);
     double delta = o->delta * fbm_exp2(o->hurst * n->levels); /* over one coarse sample */
-    fbm_status status = n->exact ? fbm_exact((size_t)n->side, o->hurst, delta, o->seed, n->exact) : FBM_NO_MEMORY;
-    return status == FBM_OK ? TL_OK : tl_fail_memory(error, "the exact coarse field");
+    double aspect = n->source.info.georef.cell_x;
+    size_t side = (size_t)n->side, bytes = fbm_exact_memory(side, aspect, o->hurst);
+    double room = physical_memory(), need = (double)bytes + (double)side * (double)side * sizeof(float);
+    if (bytes == 0 || (room > 0 && need > room))
+        return tl_fail(error, TL_ERROR_MEMORY,
+                       "scheme 'exact': %lld samples a side do not fit into memory (%.3g GB of %.3g); take fewer, or "
+                       "'stationary'",
+                       (long long)n->side, need / 1e9, room / 1e9);
+    n->exact = tl_alloc_grid(n->side, n->side, sizeof *n->exact);
+    fbm_status status = n->exact ? fbm_exact_cells(side, aspect, o->hurst, delta, o->seed, n->exact) : FBM_NO_MEMORY;
+    return status == FBM_OK ? TL_OK : tl_fail_memory(error, "the exact field");
 }
 
-static tl_status note_all(noise *n, const tl_noise_options *o, const fbm_scheme *scheme, tl_error *error)
+static tl_status note_all(noise *n, const tl_noise_options *o, const char *scheme, tl_error *error)
 {
-    char seed[TL_NUMBER_TEXT], hurst[TL_NUMBER_TEXT], delta[TL_NUMBER_TEXT];
+    char seed[TL_NUMBER_TEXT], hurst[TL_NUMBER_TEXT], delta[TL_NUMBER_TEXT], aspect[TL_NUMBER_TEXT];
     snprintf(seed, sizeof seed, "%llu", (unsigned long long)o->seed);
     tl_number_text(o->hurst, hurst);
     tl_number_text(o->delta, delta);
-    const tl_parameter all[] = {{"scheme", scheme->name}, {"seed", seed}, {"hurst", hurst}, {"delta", delta}};
+    tl_number_text(o->aspect, aspect);
+    const tl_parameter all[] = {
+        {"scheme", scheme}, {"seed", seed}, {"hurst", hurst}, {"delta", delta}, {"aspect", aspect}};
+    size_t noted = sizeof all / sizeof *all - (o->aspect == 0);
     tl_source_info *info = &n->source.info;
     tl_parameter *list = NULL;
     size_t count = 0;
     tl_status status = tl_parameters_add_origin(&list, &count, info, error);
-    for (size_t i = 0; i < sizeof all / sizeof *all && status == TL_OK; i++)
+    for (size_t i = 0; i < noted && status == TL_OK; i++)
         status = tl_parameters_add(&list, &count, all[i].name, all[i].value, error);
     info->parameters = n->parameters = list;
     info->parameter_count = count;
     return status;
 }
 
+static void set_chain(noise *n, const tl_noise_options *o, const fbm_scheme *scheme, double aspect)
+{
+    double hursts[SCENE_LEVEL_MAX + 1], mean = fbm_pow(aspect, o->hurst / 2); /* delta over a cell's mean side */
+    for (int l = 0; l < n->levels; l++) {
+        fbm_step *step = &n->chain.steps[l];
+        /* the finest step is always level -1, so that a larger surface is another one, but of the same kind */
+        *step = (fbm_step){.scheme = scheme, .seed = o->seed, .level = l - n->levels};
+        step->amplitude = (float)(o->delta * mean * fbm_exp2(o->hurst * (n->levels - l)));
+        hursts[l] = o->hurst;
+    }
+    if (n->levels > 0)
+        scene_chain_fit_aspect(&n->chain, aspect, hursts, n->levels - 1);
+}
+
 tl_source *tl_noise_create(const tl_noise_options *o, tl_error *error)
 {
-    const fbm_scheme *scheme = scene_scheme(o->scheme, error);
+    bool exact = o->scheme && !strcmp(o->scheme, SCENE_EXACT);
+    const fbm_scheme *scheme = exact ? fbm_schemes : scene_scheme(o->scheme, error);
     if (!scheme || check(o, error) != TL_OK)
         return NULL;
     noise *n = calloc(1, sizeof *n);
@@ -112,24 +152,22 @@ tl_source *tl_noise_create(const tl_noise_options *o, tl_error *error)
         tl_fail_memory(error, "the noise");
         return NULL;
     }
-    while (((o->size - 1) >> n->levels) > COARSE_CELLS)
+    while (!exact && ((o->size - 1) >> n->levels) > COARSE_CELLS)
         n->levels++;
-    n->side = tl_div_up(o->size - 1, INT64_C(1) << n->levels) + 1 + 2 * HALO;
     n->source = (tl_source){.info = {.width = o->size,
                                      .height = o->size,
-                                     .type = TL_RASTER_POINT,
+                                     .type = scheme->cells ? TL_RASTER_AREA : TL_RASTER_POINT,
                                      .georef = tl_georef_none(),
                                      .name = "noise"},
                             .read = noise_read,
                             .destroy = noise_destroy};
-    for (int l = 0; l < n->levels; l++) {
-        fbm_step *step = &n->chain.steps[l];
-        /* the finest step is always level -1, so that a larger surface is another one, but of the same kind */
-        *step = (fbm_step){.scheme = scheme, .seed = o->seed, .level = l - n->levels};
-        scheme->weights(o->hurst, &step->weights);
-        step->amplitude = (float)(o->delta * fbm_exp2(o->hurst * (n->levels - l)));
-    }
-    if (note_all(n, o, scheme, error) != TL_OK || make_exact(n, o, error) != TL_OK) {
+    double aspect = o->aspect != 0 ? o->aspect : 1;
+    n->source.info.georef.cell_x = n->source.info.georef.transform[1] = aspect;
+    n->source.info.georef.located = aspect != 1;
+    set_chain(n, o, scheme, aspect);
+    n->halo = exact ? 0 : HALO + ROW_HALO * n->chain.shape.halvings;
+    n->side = tl_div_up(o->size - 1, INT64_C(1) << n->levels) + 1 + 2 * n->halo;
+    if (note_all(n, o, exact ? SCENE_EXACT : scheme->name, error) != TL_OK || make_exact(n, o, error) != TL_OK) {
         noise_destroy(&n->source);
         return NULL;
     }
