@@ -5,6 +5,7 @@
 #include "lib/base/georef.h"
 #include "lib/base/parallel.h"
 #include "lib/base/size.h"
+#include "lib/out/mip.h"
 #include "lib/out/out.h"
 
 #include <openexr.h>
@@ -109,7 +110,7 @@ static exr_result_t set_parameters(exr_context_t file, const tl_source_info *inf
     return code;
 }
 
-static exr_result_t set_header(exr_context_t file, const tl_source_info *info, tl_compression compression)
+static exr_result_t set_header(exr_context_t file, const tl_source_info *info, const tl_write_options *options)
 {
     exr_attr_box2i_t window;
     exr_attr_v2f_t centre;
@@ -122,9 +123,11 @@ static exr_result_t set_header(exr_context_t file, const tl_source_info *info, t
     if (code ==
         EXR_ERR_SUCCESS) /* random order, for the file is complete when it gets its name; ours is always the same */
         code = exr_initialize_required_attr(file, PART, &window, &window, 1.0f, &centre, 1.0f, EXR_LINEORDER_RANDOM_Y,
-                                            compression_of(compression));
+                                            compression_of(options->compression));
     if (code == EXR_ERR_SUCCESS)
-        code = exr_set_tile_descriptor(file, PART, OUT_TILE, OUT_TILE, EXR_TILE_ONE_LEVEL, EXR_TILE_ROUND_DOWN);
+        code = exr_set_tile_descriptor(file, PART, OUT_TILE, OUT_TILE,
+                                       options->mip ? EXR_TILE_MIPMAP_LEVELS : EXR_TILE_ONE_LEVEL,
+                                       options->mip ? EXR_TILE_ROUND_UP : EXR_TILE_ROUND_DOWN);
     if (code == EXR_ERR_SUCCESS)
         code = exr_add_channel(file, PART, "Y", EXR_PIXEL_FLOAT, EXR_PERCEPTUALLY_LINEAR, 1, 1);
     if (code == EXR_ERR_SUCCESS)
@@ -149,7 +152,9 @@ typedef struct worker {
 typedef struct writing {
     const tl_source *source;
     exr_context_t file;
-    out_tiling tiling;
+    out_tiling tiling; /* of the level in hand */
+    int level;         /* halvings of the source's finest */
+    out_mip mip;
     worker *workers;
     stream *to;
 } writing;
@@ -166,8 +171,8 @@ static exr_result_t encode(const writing *w, worker *self, tl_window window)
 {
     exr_chunk_info_t chunk;
     exr_encode_pipeline_t *pipeline = &self->pipeline;
-    exr_result_t code =
-        exr_write_tile_chunk_info(w->file, PART, (int)(window.x / OUT_TILE), (int)(window.y / OUT_TILE), 0, 0, &chunk);
+    exr_result_t code = exr_write_tile_chunk_info(w->file, PART, (int)(window.x / OUT_TILE), (int)(window.y / OUT_TILE),
+                                                  w->level, w->level, &chunk);
     if (code == EXR_ERR_SUCCESS)
         code = self->begun ? exr_encoding_update(w->file, PART, &chunk, pipeline)
                            : exr_encoding_initialize(w->file, PART, &chunk, pipeline);
@@ -185,14 +190,26 @@ static exr_result_t encode(const writing *w, worker *self, tl_window window)
     return code == EXR_ERR_SUCCESS ? exr_encoding_run(w->file, PART, pipeline) : code;
 }
 
+static tl_status read_tile(const writing *w, tl_window window, float *out, tl_error *error)
+{
+    if (w->level == 0)
+        return tl_source_read(w->source, w->source->info.level, window, out, error);
+    const struct out_mip_level *level = &w->mip.levels[w->level];
+    for (int64_t y = 0; y < window.height; y++)
+        memcpy(out + y * window.width, level->heights + (window.y + y) * level->width + window.x,
+               (size_t)window.width * sizeof *out);
+    return TL_OK;
+}
+
 static tl_status write_tile(void *context, tl_parallel *loop, uint64_t tile, unsigned index, tl_error *error)
 {
     writing *w = context;
     worker *self = &w->workers[index];
     tl_window window = out_tile_window(&w->tiling, tile);
-    tl_status status = tl_source_read(w->source, w->source->info.level, window, self->heights, error);
+    tl_status status = read_tile(w, window, self->heights, error);
     if (status != TL_OK)
         return status;
+    out_mip_add(&w->mip, w->level, window, self->heights);
     out_extent_add(&self->extent, self->heights, (size_t)(window.width * window.height));
     self->loop = loop;
     self->tile = tile;
@@ -205,10 +222,24 @@ static tl_status write_tile(void *context, tl_parallel *loop, uint64_t tile, uns
     return TL_OK;
 }
 
+/* Level after level; the coarser ones are there when the finer ones are written. */
+static tl_status write_levels(writing *w, const tl_run *run, tl_error *error)
+{
+    tl_status status = TL_OK;
+    tl_run quiet = run ? *run : (tl_run){0};
+    quiet.progress = NULL; /* of the coarser levels, which are no work */
+    for (w->level = 0; w->level < w->mip.count && status == TL_OK; w->level++) {
+        int64_t width = w->mip.levels[w->level].width, height = w->mip.levels[w->level].height;
+        w->tiling = (out_tiling){tl_div_up(width, OUT_TILE), tl_div_up(height, OUT_TILE), width, height};
+        uint64_t tiles = (uint64_t)w->tiling.columns * (uint64_t)w->tiling.rows;
+        status = tl_parallel_for(w->level ? &quiet : run, tiles, (uint64_t)(width * height), write_tile, w, error);
+    }
+    return status;
+}
+
 static tl_status write_tiles(writing *w, const tl_run *run, out_extent *extent, tl_error *error)
 {
-    uint64_t tiles = (uint64_t)w->tiling.columns * (uint64_t)w->tiling.rows;
-    unsigned count = tl_parallel_workers(run, tiles);
+    unsigned count = tl_parallel_workers(run, (uint64_t)w->tiling.columns * (uint64_t)w->tiling.rows);
     tl_status status = TL_OK;
     w->workers = calloc(count, sizeof *w->workers);
     if (!w->workers)
@@ -220,7 +251,7 @@ static tl_status write_tiles(writing *w, const tl_run *run, out_extent *extent, 
             status = tl_fail_memory(error, tl_output_path(w->to->output));
     }
     if (status == TL_OK)
-        status = tl_parallel_for(run, tiles, (uint64_t)(w->tiling.width * w->tiling.height), write_tile, w, error);
+        status = write_levels(w, run, error);
     for (unsigned i = 0; i < count; i++) {
         out_extent_merge(extent, &w->workers[i].extent);
         if (w->workers[i].begun)
@@ -288,13 +319,19 @@ tl_status out_exr_write(const tl_source *source, tl_output *output, const tl_wri
     start.user_data = &to;
     start.write_fn = on_write;
     writing w = {.source = source, .tiling = out_tiling_of(source), .to = &to};
+    status = out_mip_init(&w.mip, options->mip, source->info.width, source->info.height, options->run, path, error);
+    if (status != TL_OK)
+        return status;
     exr_result_t code = exr_start_write(&w.file, path, EXR_WRITE_FILE_DIRECTLY, &start);
-    if (code != EXR_ERR_SUCCESS)
+    if (code != EXR_ERR_SUCCESS) {
+        out_mip_finish(&w.mip);
         return tl_fail(error, TL_ERROR_IO, "%s: OpenEXR cannot write it: %s", path,
                        exr_get_default_error_message(code));
-    code = set_header(w.file, &source->info, options->compression);
+    }
+    code = set_header(w.file, &source->info, options);
     out_extent extent = out_extent_empty();
     status = code == EXR_ERR_SUCCESS ? write_tiles(&w, options->run, &extent, error) : exr_failed(code, &to, error);
+    out_mip_finish(&w.mip);
     code = exr_finish(&w.file);
     if (status == TL_OK && code != EXR_ERR_SUCCESS)
         status = exr_failed(code, &to, error);
