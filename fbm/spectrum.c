@@ -104,7 +104,9 @@ void fbm_spectrum_radial(const double *power, size_t side, double *radial)
 
 /* ---- fit ---- */
 
-enum { ALIASES = 3, FIRST = 5 };
+enum { ALIASES = 2, FIRST = 5, ROUNDS = 30 };
+
+static const double lowest = 0.01, highest = 1.95; /* exponents */
 
 typedef struct ordinates {
     size_t side;
@@ -171,91 +173,58 @@ static bool counts(const ordinates *o, size_t i, size_t j)
     return k2 >= FIRST * FIRST && k2 <= most * most;
 }
 
-/* The amplitude that is likeliest at the model, by Newton's rule from the mean ratio, and minus the likelihood's
- * logarithm. */
-static double likelihood(ordinates *o, double hurst, double *amplitude)
-{
-    make_model(o, hurst);
-    double a = 0, n = 0, sum = 0;
-    for (size_t j = 0; j < o->side; j++)
-        for (size_t i = 0; i < o->side; i++)
-            if (counts(o, i, j)) {
-                double clean = o->power[j * o->side + i] - o->noise;
-                a += clean / o->smeared[j * o->side + i];
-                n++;
-            }
-    a = a / n > 0 ? a / n : 1e-300;
-    for (int round = 0; round < 8 && o->noise > 0; round++) {
-        double slope = 0, bend = 0;
-        for (size_t k = 0; k < o->side * o->side; k++)
-            if (counts(o, k % o->side, k / o->side)) {
-                double m = o->smeared[k], f = a * m + o->noise;
-                slope += (o->power[k] - f) * m / (f * f);
-                bend += m * m / (f * f);
-            }
-        double next = a + slope / bend;
-        a = next > 0.1 * a ? next : 0.1 * a;
-    }
-    for (size_t k = 0; k < o->side * o->side; k++)
-        if (counts(o, k % o->side, k / o->side)) {
-            double f = a * o->smeared[k] + o->noise;
-            sum += log(f) + o->power[k] / f;
-        }
-    *amplitude = a;
-    return sum;
-}
+/* log amplitude and H, and the information on H with the amplitude free. */
+typedef struct scoring {
+    double log_amplitude, hurst, information;
+} scoring;
 
-/* Of independent exponential ordinates, half of which repeat the others: the information on H with the amplitude free
- * is 1/2 sum (g - mean g)^2, g the model's logarithmic slope in H. Hann's taper makes an ordinate share (35/18)^2 in
- * the two directions with its neighbours: as many times fewer are independent. */
-static double error_of(ordinates *o, double hurst, double amplitude)
+/* One step of Fisher's scoring. With f = a m + noise and s = a m / f, an exponential ordinate I has the scores
+ * s (I / f - 1) for log a and s g (I / f - 1) for H, g the slope of log m in H. Half of the ordinates repeat the
+ * others, and Hann's taper makes them share (35/18)^2 times more with their neighbours than independent ones. */
+static bool score(ordinates *o, double *before, scoring *at)
 {
+    const double half_step = 0.005, repeated = 0.5 * o->windows / (35.0 / 18 * 35 / 18);
     size_t samples = o->side * o->side;
-    double *before = malloc(samples * sizeof *before), sum = 0, squares = 0, n = 0;
-    if (!before)
-        return (double)NAN;
-    make_model(o, hurst - 0.005);
+    double aa = 0, ah = 0, hh = 0, ra = 0, rh = 0, amplitude = exp(at->log_amplitude);
+    make_model(o, at->hurst - half_step);
     memcpy(before, o->smeared, samples * sizeof *before);
-    make_model(o, hurst + 0.005);
-    double weight = 0;
+    make_model(o, at->hurst + half_step);
     for (size_t k = 0; k < samples; k++)
         if (counts(o, k % o->side, k / o->side)) {
-            double share = 1 / (1 + o->noise / (amplitude * o->smeared[k])); /* what is not noise */
-            double g = (log(o->smeared[k]) - log(before[k])) / 0.01 * share;
-            sum += g * share;
-            squares += g * g;
-            weight += share * share;
-            n++;
+            double m = sqrt(before[k] * o->smeared[k]), g = log(o->smeared[k] / before[k]) / (2 * half_step);
+            double f = amplitude * m + o->noise, s = amplitude * m / f, r = o->power[k] / f - 1;
+            aa += s * s;
+            ah += s * s * g;
+            hh += s * s * g * g;
+            ra += s * r;
+            rh += s * g * r;
         }
-    free(before);
-    double information = 0.5 * o->windows * (squares - sum * sum / weight) / (35.0 / 18 * 35 / 18);
-    return n > 2 && information > 0 ? 1 / sqrt(information) : (double)NAN;
+    double determinant = aa * hh - ah * ah;
+    if (!(determinant > 0))
+        return false;
+    double step = (aa * rh - ah * ra) / determinant;
+    step = step > 0.3 ? 0.3 : step < -0.3 ? -0.3 : step;
+    double hurst = at->hurst + step;
+    hurst = hurst < lowest ? lowest : hurst > highest ? highest : hurst;
+    step = hurst - at->hurst;
+    double grow = (ra - ah * step) / aa;
+    at->hurst = hurst;
+    at->log_amplitude += grow > 2 ? 2 : grow < -2 ? -2 : grow;
+    at->information = repeated * determinant / aa;
+    return isfinite(at->hurst) && isfinite(at->log_amplitude);
 }
 
-/* Golden section over H. */
-static double likeliest(ordinates *o, double *amplitude)
+/* The first guess: H = 1/2, and the amplitude by the mean ratio. */
+static scoring guess(ordinates *o)
 {
-    const double golden = 0.61803398874989485;
-    double low = 0.01, high = 1.95, a = high - golden * (high - low), b = low + golden * (high - low);
-    double at_a = likelihood(o, a, amplitude), at_b = likelihood(o, b, amplitude);
-    for (int k = 0; k < 16; k++) {
-        if (at_a < at_b) {
-            high = b;
-            b = a;
-            at_b = at_a;
-            a = high - golden * (high - low);
-            at_a = likelihood(o, a, amplitude);
-        } else {
-            low = a;
-            a = b;
-            at_a = at_b;
-            b = low + golden * (high - low);
-            at_b = likelihood(o, b, amplitude);
+    double ratio = 0, n = 0;
+    make_model(o, 0.5);
+    for (size_t k = 0; k < o->side * o->side; k++)
+        if (counts(o, k % o->side, k / o->side)) {
+            ratio += o->power[k] / o->smeared[k];
+            n++;
         }
-    }
-    double hurst = 0.5 * (low + high);
-    likelihood(o, hurst, amplitude);
-    return hurst;
+    return (scoring){.log_amplitude = log(ratio / n), .hurst = 0.5};
 }
 
 /* The spectrum of fBm in the plane with E|Z(x+h) - Z(x)|^2 = |h|^2H is c |k|^-(2H+2), k in cycles,
@@ -272,7 +241,7 @@ fbm_status fbm_spectrum_fit_power(const double *power, size_t side, double windo
 {
     size_t samples = side * side;
     *out = (fbm_spectrum_fit){0};
-    double *room = malloc(2 * samples * sizeof *room);
+    double *room = malloc(3 * samples * sizeof *room);
     if (!room)
         return FBM_NO_MEMORY;
     ordinates o = {.side = side,
@@ -283,13 +252,21 @@ fbm_status fbm_spectrum_fit_power(const double *power, size_t side, double windo
                    .power = power,
                    .model = room,
                    .smeared = room + samples};
-    double amplitude;
-    out->hurst = likeliest(&o, &amplitude);
-    out->hurst_error = error_of(&o, out->hurst, amplitude);
-    out->known = isfinite(out->hurst_error) && out->hurst > 0.011 && out->hurst < 1.94;
-    if (out->hurst < 0.995)
-        out->delta = sqrt(amplitude / spectral_constant(out->hurst)) /
-                     fbm_pow(cell_x * cell_y, 0.5 * out->hurst); /* from samples to the unit of distance */
+    scoring at = guess(&o);
+    bool good = isfinite(at.log_amplitude), still = false;
+    for (int round = 0; good && !still && round < ROUNDS; round++) {
+        double before = at.hurst;
+        good = score(&o, room + 2 * samples, &at);
+        still = fabs(at.hurst - before) < 1e-6;
+    }
     free(room);
+    out->known = good && still && at.information > 0 && at.hurst > lowest && at.hurst < highest;
+    if (!out->known)
+        return FBM_OK;
+    out->hurst = at.hurst;
+    out->hurst_error = 1 / sqrt(at.information);
+    if (out->hurst < 0.995) /* from samples to the unit of distance */
+        out->delta = exp(0.5 * at.log_amplitude) / sqrt(spectral_constant(out->hurst)) /
+                     fbm_pow(cell_x * cell_y, 0.5 * out->hurst);
     return FBM_OK;
 }

@@ -351,17 +351,23 @@ static observations observe(const fbm_sampling *s, const fbm_moment_table moment
     return o;
 }
 
-/* The logarithm of the mean square that fBm with delta 1 has, for each value. */
+/* The logarithm of the mean square that fBm with delta 1 has, for each value. All displacements are powers of two, and
+ * those along both diagonals alike. */
 static void model_logs(const fbm_sampling *s, const observations *o, double hurst, double *logs)
 {
+    enum { POWERS = FBM_FIT_LAGS + 1, AXES = 3 };
     variogram v = {.hurst = hurst, .cell_x = s->cell_x, .cell_y = s->cell_y, .area = s->area};
+    double origin = v.area ? power_of_means(&v, 0, 0) : 0, at[POWERS][AXES];
+    for (int k = 0; k < POWERS; k++)
+        for (int axis = 0; axis < AXES; axis++) {
+            int x = fbm_directions[axis][0] << k, y = fbm_directions[axis][1] << k;
+            at[k][axis] = v.area ? power_of_means(&v, x, y) : power_at(&v, x, y);
+        }
     for (int k = 0; k < o->count; k++) {
-        increment a = increment_of(s->order, o->index[k]);
-        int x = a.lag * abs(fbm_directions[a.direction][0]), y = a.lag * abs(fbm_directions[a.direction][1]);
-        double at[3];
-        for (int m = 0; m < 3; m++)
-            at[m] = v.area ? power_of_means(&v, m * x, m * y) : power_at(&v, m * x, m * y);
-        logs[k] = log(fabs(s->order == 2 ? 4 * (at[1] - at[0]) - (at[2] - at[0]) : at[1] - at[0]));
+        size_t lag = o->index[k] / FBM_DIRECTIONS, direction = o->index[k] % FBM_DIRECTIONS;
+        size_t axis = direction < AXES ? direction : AXES - 1;
+        double one = at[lag][axis] - origin, two = at[lag + 1][axis] - origin;
+        logs[k] = log(fabs(s->order == 2 ? 4 * one - two : one));
     }
 }
 
@@ -549,13 +555,16 @@ bool fbm_fit_increments(const fbm_sampling *s, const fbm_moment_table moments,
         return true;
     double own[FBM_FIT_VALUES][FBM_FIT_VALUES], unknown[UNKNOWNS] = {first_guess(&o)};
     system_t e;
-    for (int pass = 0; pass < 2; pass++) {
+    for (int pass = 0; pass < (given ? 1 : 2); pass++) {
         if (!given && !fbm_increment_covariance(s, unknown[0], own))
             return false;
         const double(*covariance)[FBM_FIT_VALUES] = given ? given : (const double(*)[FBM_FIT_VALUES])own;
         bool good = weigh(&o, s->order, covariance, &e);
-        for (int round = 0; good && round < ROUNDS; round++)
+        double before = (double)NAN;
+        for (int round = 0; good && round < ROUNDS && !(fabs(unknown[0] - before) < 1e-9); round++) {
+            before = unknown[0];
             good = improve(s, &o, covariance, &e, unknown);
+        }
         if (!good)
             return true;
     }
