@@ -190,8 +190,8 @@ TL_API tl_source *tl_array_source_create(const float *heights, const tl_source_i
  */
 TL_API tl_source *tl_open(const char *path, tl_error *error);
 
-/* Heights rounded to multiples of `quantum` (units of height, above 0): a field in steps of 1/64 m takes half the room in a
- * compressed file. No height moves by more than half of it. */
+/* Heights rounded to multiples of `quantum` (units of height, above 0): a field in steps of 1/64 m takes half the room
+ * in a compressed file. No height moves by more than half of it. */
 TL_API tl_source *tl_quantized_create(const tl_source *source, double quantum, tl_error *error);
 
 /* ---- Elevation models -------------------------------------------------------------------------- */
@@ -781,7 +781,8 @@ typedef struct tl_write_options {
     bool overwrite; /* replace an existing file; else TL_ERROR_IO */
     bool validity;  /* of grids, not meshes: also write each sample's tl_validity, to NAME.validity.tif for NAME.exr */
     tl_compression compression;
-    tl_mip mip; /* EXR only: a mipmap down to one sample, its sizes rounded up. It is gathered in memory, a third of the grid */
+    tl_mip mip; /* EXR only: a mipmap down to one sample, its sizes rounded up. It is gathered in memory, a third of the
+                   grid */
     tl_frame frame;
     const tl_run *run;
 } tl_write_options;
