@@ -10,6 +10,7 @@
 static const char *const compressions[] = {
     [TL_COMPRESSION_DEFAULT] = "default", [TL_COMPRESSION_NONE] = "none", [TL_COMPRESSION_ZIP] = "zip",
     [TL_COMPRESSION_ZIPS] = "zips",       [TL_COMPRESSION_PIZ] = "piz",   NULL};
+static const char *const mips[] = {[TL_MIP_NONE] = "none", [TL_MIP_LATTICE] = "lattice", [TL_MIP_BOX] = "box", NULL};
 static const char *const supports[] = {
     [TL_SUPPORT_RASTER] = "raster", [TL_SUPPORT_AREA] = "area", [TL_SUPPORT_POINT] = "point", NULL};
 
@@ -18,7 +19,9 @@ typedef struct settings {
     tl_field_options field;
     tl_noise_options noise;
     int64_t levels, seed;
-    int compression, frame, support;
+    int compression, mip, frame, support;
+    double quantum; /* step of the heights */
+    bool quantum_given;
     bool size_given, hurst_given, delta_given;
     double max_error; /* of the framework that the DEM is reduced to first */
     bool max_error_given, verify;
@@ -34,19 +37,40 @@ static void report(const settings *set, const tl_source *made, double seconds)
         command_say(&set->common, "  %s: %s", made->info.parameters[i].name, made->info.parameters[i].value);
 }
 
+static tl_status write_grid(const settings *set, const tl_source *made, const tl_run *run, tl_error *error)
+{
+    const tl_write_options options = {.overwrite = set->common.overwrite,
+                                      .validity = set->common.voids && strcmp(set->common.voids, "keep") != 0,
+                                      .compression = (tl_compression)set->compression,
+                                      .mip = (tl_mip)set->mip,
+                                      .frame = (tl_frame)set->frame,
+                                      .run = run};
+    if (!set->quantum_given)
+        return tl_write_grid(made, set->common.output, &options, error);
+    tl_source *steps = tl_quantized_create(made, set->quantum, error);
+    tl_status status = steps ? tl_write_grid(steps, set->common.output, &options, error) : TL_ERROR_MEMORY;
+    tl_source_destroy(steps);
+    return status;
+}
+
 static int write_out(const settings *set, const tl_source *made, const tl_run *run, progress *bar)
 {
     tl_error error;
     progress_stage(bar, "synthesis");
-    tl_write_options options = {.overwrite = set->common.overwrite,
-                                .validity = set->common.voids && strcmp(set->common.voids, "keep") != 0,
-                                .compression = (tl_compression)set->compression,
-                                .frame = (tl_frame)set->frame,
-                                .run = run};
-    if (tl_write_grid(made, set->common.output, &options, &error) != TL_OK)
+    if (write_grid(set, made, run, &error) != TL_OK)
         return command_failed(bar, &error);
     report(set, made, progress_end(bar));
     return EXIT_DONE;
+}
+
+/* Whether the output's format holds what is asked for. */
+static bool mip_ok(const settings *set)
+{
+    const tl_format *format = tl_format_of(set->common.output);
+    if (!set->mip || (format && strcmp(format->ending, "exr") == 0))
+        return true;
+    complain("--mip: only .exr holds coarser levels, not %s; leave it out", set->common.output);
+    return false;
 }
 
 /* ---- synth ---- */
@@ -243,13 +267,19 @@ static int run_synth(const command *self, int argc, const char **argv, bool help
         {"scheme", 0, OPTION_TEXT, &set.field.scheme, NULL, "NAME",
          "way to refine, listed below (default: terrain; stationary with --hurst or --delta)", 0, 0, NULL},
         {"support", 0, OPTION_CHOICE, &set.support, NULL, "KIND",
-         "what the samples stand for: raster, area (means over cells) or point (default: raster, what the file says)",
-         0, 0, supports},
+         "what samples stand for: as the raster says, means over cells, or points (default: raster)", 0, 0, supports},
         {0}};
     const option input[] = {COMMON_INPUT(set.common), {0}};
     const option output[] = {COMMON_OUTPUT(set.common),
                              {"compression", 0, OPTION_CHOICE, &set.compression, NULL, "KIND",
                               "of .exr and .tif (default: zip)", 0, 0, compressions},
+                             {"height-quantum", 0, OPTION_NUMBER, &set.quantum, &set.quantum_given, "Q",
+                              "round heights to multiples of Q, in the DEM's unit, 1e-30...1e30: smaller files "
+                              "(default: as they are)",
+                              1e-30, 1e30, NULL},
+                             {"mip", 0, OPTION_CHOICE, &set.mip, NULL, "KIND",
+                              "coarser levels in an .exr, of every second sample or of means (default: none)", 0, 0,
+                              mips},
                              {"frame", 0, OPTION_CHOICE, &set.frame, NULL, "FRAME",
                               "coordinates of a mesh (default: enu where the CRS is known)", 0, 0, frame_names},
                              {0}};
@@ -265,8 +295,8 @@ static int run_synth(const command *self, int argc, const char **argv, bool help
     set.field.levels = (int)set.levels;
     set.field.seed = (uint64_t)set.seed;
     set.field.support = (tl_support)set.support;
-    bool good =
-        (!set.field.scheme || names_scheme(set.field.scheme, false)) && command_output_ok(&set.common, true, true);
+    bool good = (!set.field.scheme || names_scheme(set.field.scheme, false)) &&
+                command_output_ok(&set.common, true, true) && mip_ok(&set);
     if (good && set.verify && !set.max_error_given) {
         complain("--verify measures against --max-error E; give that too");
         good = false;
@@ -315,6 +345,13 @@ static int run_noise(const command *self, int argc, const char **argv, bool help
     const option output[] = {COMMON_OUTPUT(set.common),
                              {"compression", 0, OPTION_CHOICE, &set.compression, NULL, "KIND",
                               "of .exr and .tif (default: zip)", 0, 0, compressions},
+                             {"height-quantum", 0, OPTION_NUMBER, &set.quantum, &set.quantum_given, "Q",
+                              "round heights to multiples of Q, in the DEM's unit, 1e-30...1e30: smaller files "
+                              "(default: as they are)",
+                              1e-30, 1e30, NULL},
+                             {"mip", 0, OPTION_CHOICE, &set.mip, NULL, "KIND",
+                              "coarser levels in an .exr, of every second sample or of means (default: none)", 0, 0,
+                              mips},
                              {0}};
     const option running[] = {COMMON_RUNNING(set.common), {0}};
     const option_group groups[] = {{"Surface", surface}, {"Output", output}, {"Running", running}, {0}};
@@ -326,8 +363,8 @@ static int run_noise(const command *self, int argc, const char **argv, bool help
         return status;
     }
     set.noise.seed = (uint64_t)set.seed;
-    bool good =
-        (!set.noise.scheme || names_scheme(set.noise.scheme, true)) && command_output_ok(&set.common, true, true);
+    bool good = (!set.noise.scheme || names_scheme(set.noise.scheme, true)) &&
+                command_output_ok(&set.common, true, true) && mip_ok(&set);
     status = good ? noise(&set) : EXIT_USAGE;
     arguments_free(&rest);
     return status;
