@@ -103,6 +103,12 @@ def installed_program(folder):
         assert a.read() == b.read(), "the library and the program make different files"
     said = run(program, "absent.tif", "c.exr", "2", fails=True, env=environment, cwd=folder)
     assert said == "absent.tif: cannot read: No such file or directory\n", said
+    verify = os.path.join(folder, "api_verify_fbm")
+    run(*CC, "-std=c11", *STRICT, os.path.join(SOURCE, "examples", "api_verify_fbm.c"), "-o", verify, *flags)
+    said = run(verify, env=environment)
+    assert said.startswith("H 0.") and said.count("\n") == 1, said
+    said = run(verify, os.path.join(SOURCE, "examples", "jacksboro.tif"), "0.7", "16", fails=True, env=environment)
+    assert "standard error" in said, said
 
 
 def main():

@@ -461,6 +461,27 @@ def json_keeps_its_schema(case):
         raise AssertionError("the schema takes anything")
 
 
+def statistics_keep_their_schema(case):
+    with open(os.path.join(ROOT, "doc", "stats.schema.json"), encoding="utf-8") as file:
+        schema = json.load(file)
+    about = json.loads(case.run("stats", EXAMPLE, "--json").out)
+    check_schema(about, schema)
+    expect(about["estimates"][0]["hurst"] > 1 and about["estimates"][0]["delta"] is None, f"{about['estimates']}")
+    write_tiff(case.path("flat.tif"), 4, 3, [0.0] * 12)
+    flat = json.loads(case.run("stats", "flat.tif", "--json").out)
+    check_schema(flat, schema)
+    expect(all(e["refusal"] for e in flat["estimates"]), f"{flat}")
+    case.run("noise", "--size", 129, "--hurst", 0.6, "-q", "-o", "noise.tif")
+    said = case.run("stats", "noise.tif", "-q", "--maps", "maps.tif", "--expect-hurst", 0.6, "--expect-delta", 1).out
+    expect(said == "", said)
+    maps = json.loads(case.run("info", "maps.tif", "--json").out)
+    expect((maps["width"], maps["height"], maps["file"]["bands"]) == (3, 3, 5), f"{maps}")
+    failed = case.run("stats", "noise.tif", "-q", "--expect-hurst", 0.9, "--tolerance", 0.02, status=1)
+    expect("standard error" in failed.err and "not within 0.02 of 0.9" in failed.err, failed.err)
+    case.run("stats", "noise.tif", "--tolerance", 0.02, status=2)
+    case.run("stats", "noise.tif", "-o", "plot.bmp", status=2)
+
+
 def real_files_keep_the_schema(case):
     schema = info_schema()
     folder = shared("dem")
@@ -916,7 +937,7 @@ TESTS = [
     input_may_be_the_output, follows_the_umask,
     tells_a_full_stdout, tells_a_broken_pipe, closed_streams_do_not_go_into_the_output,
     bar_only_on_a_terminal, progress_lines_are_json, quiet_is_silent,
-    json_keeps_its_schema, real_files_keep_the_schema, window_costs_its_blocks, a_part_is_that_part, corners_agree_with_gdal,
+    json_keeps_its_schema, statistics_keep_their_schema, real_files_keep_the_schema, window_costs_its_blocks, a_part_is_that_part, corners_agree_with_gdal,
     names_of_any_bytes,
     formats_hold_the_same_heights, png_within_half_a_step, point_samples_are_kept, point_samples_of_the_andes_are_kept,
     area_means_stay_on_their_footprint,
