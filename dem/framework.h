@@ -24,6 +24,8 @@ typedef struct tl_tie {
     int32_t x[3], y[3];
 } tl_tie;
 
+enum { TL_STAGES = 32 };
+
 struct tl_framework {
     tl_source_info info; /* of the DEM; what it points to is the framework's own */
     double max_error;
@@ -42,8 +44,9 @@ struct tl_framework {
     size_t point_count, isolated_count;
     tl_tie *ties;
     size_t tie_count;
-    /* Of one that came out of a file: what fills it between its points; else 0. */
-    double hurst, delta;
+    /* Of one that came out of a file: what fills it between its points; else 0. The spreads are by stage, s = 1, 2, 4
+     * and so on: factors on the standard deviation that fBm of this exponent and delta 1 leaves there, in S / 4. */
+    double hurst, spread[TL_STAGES];
 };
 
 static inline bool tl_bit(const uint64_t *bits, size_t words, int64_t x, int64_t y)
@@ -89,6 +92,9 @@ void tl_framework_mark_limits(tl_framework *framework, const tl_pyramid *pyramid
 
 /* Heights of the points among samples x ... x + count - 1 of row y; NaN for the others. */
 void tl_framework_heights(const tl_framework *framework, int64_t x, int64_t y, int64_t count, float *out);
+
+/* Marks what voids need, the NaN among heights: triangles that hold some of them are split. */
+void tl_framework_mark_voids(tl_framework *framework, const float *heights);
 
 /* Number of triangles of the mesh. */
 tl_status tl_framework_count_triangles(const tl_framework *framework, size_t *count, tl_error *error);

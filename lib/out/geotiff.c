@@ -25,6 +25,7 @@
 enum {
     TILE_BYTES = OUT_TILE * OUT_TILE * (int)sizeof(float),
     DEFLATE_LEVEL = 6,
+    SPARSE_LEVEL = 9,      /* there is little to compress */
     GDAL_METADATA = 42112, /* GDAL's private tags */
     GDAL_NODATA = 42113,
     METADATA_LIMIT = 16384,
@@ -248,7 +249,7 @@ static bool set_bands(TIFF *tiff, size_t bands)
 {
     uint16_t other[OUT_BANDS] = {EXTRASAMPLE_UNSPECIFIED};
     bool good = TIFFSetField(tiff, TIFFTAG_SAMPLESPERPIXEL, (int)bands) == 1 &&
-                TIFFSetField(tiff, TIFFTAG_PLANARCONFIG, bands > 1 ? PLANARCONFIG_SEPARATE : PLANARCONFIG_CONTIG) == 1;
+                TIFFSetField(tiff, TIFFTAG_PLANARCONFIG, PLANARCONFIG_CONTIG) == 1;
     return good && (bands == 1 || TIFFSetField(tiff, TIFFTAG_EXTRASAMPLES, (int)bands - 1, other) == 1);
 }
 
@@ -324,10 +325,11 @@ typedef struct writing {
 
 static bool worker_init(worker *self, const writing *w)
 {
-    self->samples = malloc(TILE_BYTES);
-    self->predicted = w->compress ? malloc(TILE_BYTES) : NULL;
+    self->samples = malloc(w->band_count * TILE_BYTES);
+    self->predicted = w->compress || w->band_count > 1 ? malloc(w->band_count * TILE_BYTES) : NULL;
     self->packed = w->compress ? malloc(w->packed_limit) : NULL;
-    self->compressor = w->compress ? libdeflate_alloc_compressor(DEFLATE_LEVEL) : NULL;
+    self->compressor =
+        w->compress ? libdeflate_alloc_compressor(w->band_count > 1 ? SPARSE_LEVEL : DEFLATE_LEVEL) : NULL;
     return self->samples && (!w->compress || (self->predicted && self->packed && self->compressor));
 }
 
@@ -340,21 +342,37 @@ static void worker_finish(worker *self)
         libdeflate_free_compressor(self->compressor);
 }
 
-static tl_status read_tile(const writing *w, worker *self, const tl_source *source, tl_window window, tl_error *error)
+static tl_status read_tile(const writing *w, worker *self, tl_window window, tl_error *error)
 {
-    int level = source->info.level;
-    tl_status status = w->validity ? tl_source_validity(source, level, window, self->samples, error)
-                                   : tl_source_read(source, level, window, self->samples, error);
-    if (status == TL_OK)
-        pad_tile(self->samples, w->validity ? 1 : sizeof(float), window);
+    int level = w->bands[0]->info.level;
+    tl_status status = TL_OK;
+    for (size_t k = 0; status == TL_OK && k < w->band_count; k++) {
+        unsigned char *to = (unsigned char *)self->samples + k * TILE_BYTES;
+        status = w->validity ? tl_source_validity(w->bands[k], level, window, to, error)
+                             : tl_source_read(w->bands[k], level, window, (float *)(void *)to, error);
+        if (status == TL_OK)
+            pad_tile(to, w->validity ? 1 : sizeof(float), window);
+    }
     return status;
+}
+
+/* The bands beside each other, sample by sample: where few samples are known, their places are stored once. */
+static void interleave(const float *bands, size_t count, float *out)
+{
+    for (size_t i = 0; i < OUT_TILE * OUT_TILE; i++)
+        for (size_t k = 0; k < count; k++)
+            *out++ = bands[k * OUT_TILE * OUT_TILE + i];
 }
 
 /* The bytes that the file holds for the tile, and how many. */
 static const void *pack_tile(const writing *w, worker *self, size_t *count)
 {
     const void *bytes = self->samples;
-    *count = w->validity ? OUT_TILE * OUT_TILE : TILE_BYTES;
+    *count = w->validity ? OUT_TILE * OUT_TILE : w->band_count * TILE_BYTES;
+    if (w->band_count > 1) {
+        interleave(self->samples, w->band_count, (float *)(void *)self->predicted);
+        bytes = self->predicted;
+    }
     if (!w->compress)
         return bytes;
     if (!w->validity && w->band_count == 1) {
@@ -365,24 +383,23 @@ static const void *pack_tile(const writing *w, worker *self, size_t *count)
     return self->packed;
 }
 
-static bool is_empty(const float *heights)
+static bool is_empty(const float *heights, size_t count)
 {
     size_t at = 0;
-    while (at < OUT_TILE * OUT_TILE && isnan(heights[at]))
+    while (at < count && isnan(heights[at]))
         at++;
-    return at == OUT_TILE * OUT_TILE;
+    return at == count;
 }
 
 static tl_status write_tile(void *context, tl_parallel *loop, uint64_t tile, unsigned index, tl_error *error)
 {
     writing *w = context;
     worker *self = &w->workers[index];
-    uint64_t tiles = (uint64_t)w->tiling.columns * (uint64_t)w->tiling.rows;
-    tl_status status = read_tile(w, self, w->bands[tile / tiles], out_tile_window(&w->tiling, tile % tiles), error);
+    tl_status status = read_tile(w, self, out_tile_window(&w->tiling, tile), error);
     if (status != TL_OK)
         return status;
     size_t count;
-    bool left_out = w->band_count > 1 && is_empty(self->samples);
+    bool left_out = w->band_count > 1 && is_empty(self->samples, w->band_count * OUT_TILE * OUT_TILE);
     const void *bytes = pack_tile(w, self, &count);
     if (!tl_parallel_wait_turn(loop, tile))
         return tl_fail(error, TL_ERROR_CANCELLED, "interrupted");
@@ -395,7 +412,7 @@ static tl_status write_tile(void *context, tl_parallel *loop, uint64_t tile, uns
 
 static tl_status write_tiles(writing *w, const tl_run *run, tl_error *error)
 {
-    uint64_t tiles = w->band_count * (uint64_t)w->tiling.columns * (uint64_t)w->tiling.rows;
+    uint64_t tiles = (uint64_t)w->tiling.columns * (uint64_t)w->tiling.rows;
     unsigned count = tl_parallel_workers(run, tiles);
     tl_status status = TL_OK;
     w->workers = calloc(count, sizeof *w->workers);
@@ -447,7 +464,7 @@ static tl_status write_geotiff(const tl_source *const *bands, size_t band_count,
                        "%s: %lld x %lld samples are too many for a TIFF; refine by fewer levels", w.path,
                        (long long)info->width, (long long)info->height);
     w.compress = options->compression != TL_COMPRESSION_NONE;
-    w.packed_limit = libdeflate_zlib_compress_bound(NULL, TILE_BYTES);
+    w.packed_limit = libdeflate_zlib_compress_bound(NULL, band_count * TILE_BYTES);
     XTIFFInitialize();
     w.tiff = open_tiff(output, band_count * (uint64_t)samples * sizeof(float) > classic_limit, &w.said);
     if (!w.tiff)

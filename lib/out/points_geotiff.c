@@ -2,11 +2,11 @@
  *
  * Three bands, void where no point is kept: the height; the Hurst exponent and the standard deviation of the height
  * difference over one sample of what lies between. Where the elevation model itself is void the exponent is 0, so that
- * holes are not taken for ground without points. The splits of the triangles follow from the points: a vertex splits
- * just where it is a point or one that needs it is. */
+ * holes are not taken for ground without points. The splits of the triangles follow from the points and the holes: a
+ * vertex splits just where it is a point, or one that needs it is, or where its triangles hold some of a hole. */
 #include "lib/out/points.h"
 
-#include "fbm/estimate.h"
+#include "fbm/elementary.h"
 #include "fbm/weights.h"
 #include "lib/base/error.h"
 #include "lib/base/georef.h"
@@ -14,12 +14,13 @@
 #include "lib/base/parallel.h"
 #include "lib/base/size.h"
 #include "lib/out/out.h"
+#include "lib/scene/points.h"
 
 #include <math.h>
 #include <stdio.h>
 #include <string.h>
 
-enum { BANDS = 3, ROWS = 64, TEXT = 64 };
+enum { BANDS = 3, ROWS = 64, TEXT = 64, SPREADS = TL_STAGES * 20 };
 
 #define LABEL "framework"
 
@@ -53,30 +54,16 @@ static tl_status read_band(const tl_source *base, int level, tl_window window, f
     return status;
 }
 
-/* Exponent and delta of the fBm that has the detail of the model's finest octave. */
-static tl_status measure(const tl_framework *framework, const tl_source *dem, const tl_run *run, double *hurst,
-                         double *delta, tl_error *error)
+static tl_status note_all(const tl_framework *framework, double hurst, const double *spread, tl_parameter **list,
+                          size_t *count, tl_error *error)
 {
-    tl_roughness found;
-    *hurst = framework->hurst, *delta = framework->delta;
-    if (*hurst > 0)
-        return TL_OK;
-    tl_status status = tl_roughness_measure(dem, run, &found, error);
-    if (status != TL_OK)
-        return status;
-    *hurst = found.measurable ? fmin(fmax(found.hurst, FBM_HURST_MIN), FBM_HURST_MAX) : 0.5;
-    *delta = found.measurable ? found.sigma / sqrt(fbm_detail_of_fbm(*hurst, dem->info.type == TL_RASTER_AREA)) : 0;
-    return TL_OK;
-}
-
-static tl_status note_all(const tl_framework *framework, double hurst, double delta, tl_parameter **list, size_t *count,
-                          tl_error *error)
-{
-    char bound[TL_NUMBER_TEXT], exponent[TL_NUMBER_TEXT], step[TL_NUMBER_TEXT];
+    char bound[TL_NUMBER_TEXT], exponent[TL_NUMBER_TEXT], spreads[SPREADS] = "";
     tl_number_text(framework->max_error, bound);
     tl_number_text(hurst, exponent);
-    tl_number_text(delta, step);
-    const tl_parameter all[] = {{LABEL, "1"}, {"max_error", bound}, {"hurst", exponent}, {"delta", step}};
+    size_t used = 0;
+    for (int k = 0; k < TL_STAGES; k++)
+        used += (size_t)snprintf(spreads + used, sizeof spreads - used, "%s%.9g", k ? " " : "", spread[k]);
+    const tl_parameter all[] = {{LABEL, "1"}, {"max_error", bound}, {"hurst", exponent}, {"spread", spreads}};
     tl_status status = TL_OK;
     for (size_t k = 0; status == TL_OK && k < sizeof all / sizeof *all; k++)
         status = tl_parameters_add(list, count, all[k].name, all[k].value, error);
@@ -86,12 +73,12 @@ static tl_status note_all(const tl_framework *framework, double hurst, double de
 tl_status out_points_geotiff(const tl_framework *framework, const tl_source *dem, tl_output *output,
                              const tl_points_options *options, tl_error *error)
 {
-    double hurst, delta;
+    double hurst, spread[TL_STAGES];
     tl_parameter *list = NULL;
     size_t count = 0;
-    tl_status status = measure(framework, dem, options->run, &hurst, &delta, error);
+    tl_status status = scene_restore_measure(framework, dem, options->run, &hurst, spread, error);
     if (status == TL_OK)
-        status = note_all(framework, hurst, delta, &list, &count, error);
+        status = note_all(framework, hurst, spread, &list, &count, error);
     band bands[BANDS];
     const tl_source *sources[BANDS];
     bool voids = framework->valid_count < (uint64_t)framework->info.width * (uint64_t)framework->info.height;
@@ -100,7 +87,7 @@ tl_status out_points_geotiff(const tl_framework *framework, const tl_source *dem
                           .framework = framework,
                           .dem = voids && k == 1 ? dem : NULL,
                           .index = k,
-                          .value = (float)(k == 1 ? hurst : delta)};
+                          .value = (float)(k == 1 ? hurst : spread[0] * fbm_exp2(hurst))};
         bands[k].base.info.parameters = list;
         bands[k].base.info.parameter_count = count;
         bands[k].base.info.has_voids = true;
@@ -171,6 +158,8 @@ static tl_status load(tl_framework *framework, const tl_source *heights, const c
         return TL_ERROR_DATA;
     float *z = tl_alloc_grid(info->width, info->height, sizeof *z);
     tl_status status = z ? read_points(framework, heights, exponents, z, error) : tl_fail_memory(error, path);
+    if (status == TL_OK && framework->voids)
+        tl_framework_mark_voids(framework, z);
     framework->voids |= !framework->columns || !framework->rows;
     const tl_rows rows = {.all = z};
     if (status == TL_OK)
@@ -180,12 +169,24 @@ static tl_status load(tl_framework *framework, const tl_source *heights, const c
     return status;
 }
 
+static bool read_spreads(const char *path, double out[TL_STAGES])
+{
+    char text[SPREADS], *at = text, *end;
+    if (!out_geotiff_item(path, "spread", text, sizeof text))
+        return false;
+    for (int k = 0; k < TL_STAGES; k++, at = end) {
+        out[k] = strtod(at, &end);
+        if (end == at || !(out[k] >= 0 && out[k] <= 1e30))
+            return false;
+    }
+    return true;
+}
+
 tl_framework *tl_framework_load(const char *path, const tl_run *run, tl_error *error)
 {
-    double bound, hurst, delta;
+    double bound, hurst, spread[TL_STAGES];
     if (!tl_framework_is_file(path) || !item_number(path, "max_error", 0, 1e30, &bound) ||
-        !item_number(path, "hurst", FBM_HURST_MIN, FBM_HURST_MAX, &hurst) ||
-        !item_number(path, "delta", 0, 1e30, &delta)) {
+        !item_number(path, "hurst", FBM_HURST_MIN, FBM_HURST_MAX, &hurst) || !read_spreads(path, spread)) {
         tl_fail(error, TL_ERROR_ARGUMENT, "%s: not a framework that talus wrote; name another file", path);
         return NULL;
     }
@@ -199,7 +200,8 @@ tl_framework *tl_framework_load(const char *path, const tl_run *run, tl_error *e
     tl_status status = framework ? load(framework, heights, path, run, error) : TL_ERROR_MEMORY;
     tl_source_destroy(heights);
     if (status == TL_OK) {
-        framework->hurst = hurst, framework->delta = delta;
+        framework->hurst = hurst;
+        memcpy(framework->spread, spread, sizeof spread);
         return framework;
     }
     tl_framework_destroy(framework);

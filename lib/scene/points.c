@@ -8,7 +8,6 @@
 
 #include "dem/framework.h"
 #include "fbm/elementary.h"
-#include "fbm/estimate.h"
 #include "fbm/rng.h"
 #include "fbm/weights.h"
 #include "lib/base/error.h"
@@ -47,7 +46,9 @@ typedef struct filler {
     float *surface; /* NaN: void */
     float *model;   /* the DEM, or NULL */
     uint64_t seed;
-    double hurst, delta, limit;
+    double hurst, delta, limit, aspect;
+    double spread[TL_STAGES]; /* see tl_framework */
+    bool hurst_given, delta_given;
     bool ignores; /* finer points: only to show what they are good for */
     scene_kriging kriging;
     cache *caches; /* by worker */
@@ -55,6 +56,9 @@ typedef struct filler {
     unsigned workers;
     int64_t s; /* of the stage, half of its spacing */
     double amplitude;
+    double *squares;  /* while it measures: by row of the half step, the residuals' squares over what fBm of delta 1 */
+    uint64_t *counts; /* at spacing 1 has, and their number; else NULL */
+    double quantum_square; /* variance of the model's rounding */
 } filler;
 
 /* ---- The triangles' surface ------------------------------------------------------------------------ */
@@ -157,7 +161,21 @@ static float within(double value, double centre, double limit)
     return z < low ? low : z > high ? high : z;
 }
 
-static void make_vertex(const filler *self, cache *own, scene_half half, int64_t x, int64_t y, double noise)
+/* Compares a dropped sample with what is expected there. */
+static void note_residual(const filler *self, const scene_weights *w, double residual, int64_t row)
+{
+    double rounding = 1;
+    for (int i = 0; i < SCENE_SITES; i++)
+        rounding += w->weights[i] * w->weights[i];
+    double square = residual * residual - self->quantum_square * rounding;
+    if (!(w->sigma > 0))
+        return;
+    self->squares[row] += square / (w->sigma * w->sigma);
+    self->counts[row]++;
+}
+
+static void make_vertex(const filler *self, cache *own, scene_half half, int64_t x, int64_t y, double noise,
+                        int64_t row)
 {
     const int32_t(*sites)[2] = self->kriging.sites[half];
     int64_t here = y * self->width + x, at[SCENE_SITES];
@@ -179,7 +197,11 @@ static void make_vertex(const filler *self, cache *own, scene_half half, int64_t
             int i = __builtin_ctzll(left);
             value += w->weights[i] * (double)self->z[at[i]];
         }
+        if (self->squares)
+            note_residual(self, w, (double)*z - value, row);
     }
+    if (self->squares)
+        return;
     *z = within(centre + held(value - centre, self->limit), centre, self->limit);
     if (self->model)
         *z = within((double)*z, (double)self->model[here], self->limit);
@@ -210,7 +232,7 @@ static tl_status fill_centres(void *context, tl_parallel *loop, uint64_t item, u
         double near = (double)g[0][i] + (double)g[2][i] + (double)g[1][i - 1] + (double)g[1][i + 1];
         double next = (double)g[0][i - 1] + (double)g[0][i + 1] + (double)g[2][i - 1] + (double)g[2][i + 1];
         make_vertex(self, &self->caches[worker], SCENE_CENTRES, (2 * i + 1) * s, (2 * j + 1) * s,
-                    taps[0] * (double)g[1][i] + taps[1] * near + taps[2] * next);
+                    taps[0] * (double)g[1][i] + taps[1] * near + taps[2] * next, (int64_t)item);
     }
     return TL_OK;
 }
@@ -241,7 +263,7 @@ static tl_status fill_edges(void *context, tl_parallel *loop, uint64_t item, uns
         double near = (double)d[0][left] + (double)d[0][left + 1] + (double)d[1][left] + (double)d[1][left + 1];
         double next = (double)g[0][i] + (double)g[2][i] + (double)g[1][i - 1] + (double)g[1][i + 1];
         make_vertex(self, &self->caches[worker], SCENE_EDGES, x, r * s,
-                    taps[0] * (double)g[1][i] + taps[1] * near + taps[2] * next);
+                    taps[0] * (double)g[1][i] + taps[1] * near + taps[2] * next, (int64_t)item);
     }
     return TL_OK;
 }
@@ -249,12 +271,50 @@ static tl_status fill_edges(void *context, tl_parallel *loop, uint64_t item, uns
 static tl_status fill_stage(filler *self, int64_t s, const tl_run *run, tl_error *error)
 {
     self->s = s;
-    self->amplitude = self->delta * fbm_pow(0.5 * (double)s, self->hurst);
+    self->amplitude = self->spread[__builtin_ctzll((unsigned long long)s)];
     tl_status status = TL_OK;
     if (s < self->height && s < self->width)
         status = tl_parallel_for(run, (uint64_t)((self->height - 1 + s) / (2 * s)), 0, fill_centres, self, error);
     if (status == TL_OK)
         status = tl_parallel_for(run, (uint64_t)((self->height - 1) / s + 1), 0, fill_edges, self, error);
+    return status;
+}
+
+/* ---- What lies between: measured on the samples that were dropped -------------------------------------- */
+
+/* The square of a stage's spread as the samples tell it that were dropped there; 0 where they are too few. Rows are
+ * added in order, so that threads do not matter. */
+static tl_status measure_stage(filler *self, int64_t s, const tl_run *run, double *square, tl_error *error)
+{
+    enum { ENOUGH = 50 };
+    uint64_t count = 0;
+    double sum = 0;
+    memset(self->squares, 0, (size_t)self->height * sizeof *self->squares);
+    memset(self->counts, 0, (size_t)self->height * sizeof *self->counts);
+    tl_status status = fill_stage(self, s, run, error);
+    for (int64_t y = 0; y < self->height; y++) {
+        sum += self->squares[y];
+        count += self->counts[y];
+    }
+    *square = count < ENOUGH || !(sum > 0) ? 0 : sum / (double)count;
+    return status;
+}
+
+/* The spread of every stage. What is dropped lies where the model is smooth, and the more so the larger the triangles
+ * are, so neither delta nor the exponent is that of the whole; a stage without samples follows the finer one. */
+static tl_status measure_dropped(filler *self, const tl_run *run, tl_error *error)
+{
+    self->squares = tl_alloc((size_t)self->height, sizeof *self->squares);
+    self->counts = tl_alloc((size_t)self->height, sizeof *self->counts);
+    if (!self->squares || !self->counts)
+        return tl_fail_memory(error, "the framework's terrain");
+    scene_kriging_init(&self->kriging, self->hurst, self->aspect);
+    tl_status status = TL_OK;
+    for (int k = 0; status == TL_OK && k < self->framework->lattice_log; k++) {
+        double square = 0;
+        status = measure_stage(self, INT64_C(1) << k, run, &square, error);
+        self->spread[k] = square > 0 ? sqrt(square) : k ? self->spread[k - 1] : 0;
+    }
     return status;
 }
 
@@ -291,6 +351,8 @@ static void free_room(filler *self)
     }
     free(self->noise);
     free(self->caches);
+    free(self->squares);
+    free(self->counts);
     free(self->surface);
     free(self->model);
 }
@@ -316,44 +378,55 @@ static tl_status place_points(filler *self, tl_error *error)
     return status;
 }
 
-static tl_status fill(filler *self, const tl_run *run, tl_error *error)
+/* Exponent and spreads: those that are given, of the framework's file, or measured. */
+static tl_status choose_model(filler *self, const tl_run *run, tl_error *error)
+{
+    const tl_framework *framework = self->framework;
+    tl_roughness found = {.measurable = false};
+    bool known = framework->hurst > 0, measures = !known && self->model;
+    tl_status status = measures && !self->hurst_given ? tl_roughness_measure(self->dem, run, &found, error) : TL_OK;
+    if (!self->hurst_given)
+        self->hurst = known ? framework->hurst : found.measurable ? found.hurst : 0.5;
+    self->hurst = fmin(fmax(self->hurst, FBM_HURST_MIN), FBM_HURST_MAX);
+    for (int k = 0; k < TL_STAGES; k++)
+        self->spread[k] = self->delta_given ? self->delta * fbm_pow(0.5 * (double)(INT64_C(1) << k), self->hurst)
+                                            : framework->spread[k];
+    if (status != TL_OK || self->delta_given || !measures)
+        return status;
+    double quantum = self->dem->info.quantum;
+    self->quantum_square = quantum * quantum / 12;
+    float *heights = self->z;
+    self->z = self->model;
+    status = measure_dropped(self, run, error);
+    self->z = heights;
+    free(self->squares);
+    free(self->counts);
+    self->squares = NULL, self->counts = NULL;
+    return status;
+}
+
+static tl_status prepare(filler *self, const tl_run *run, tl_error *error)
 {
     const tl_georef *georef = &self->framework->info.georef;
-    double aspect = georef->cell_x > 0 && georef->cell_y > 0 ? georef->cell_x / georef->cell_y : 1;
+    self->aspect = georef->cell_x > 0 && georef->cell_y > 0 ? georef->cell_x / georef->cell_y : 1;
+    self->aspect = fmin(fmax(self->aspect, 0.05), 20);
+    if (!(self->delta >= 0 && self->delta <= 1e30))
+        return tl_fail(error, TL_ERROR_ARGUMENT, "delta must be from 0 to 1e30, not %g", self->delta);
     tl_status status = make_room(self, run, error);
     if (status == TL_OK)
         status = draw_surface(self, error);
     if (status == TL_OK)
         status = place_points(self, error);
-    if (status != TL_OK)
-        return status;
-    scene_kriging_init(&self->kriging, self->hurst, fmin(fmax(aspect, 0.05), 20));
+    return status == TL_OK ? choose_model(self, run, error) : status;
+}
+
+static tl_status fill(filler *self, const tl_run *run, tl_error *error)
+{
+    tl_status status = prepare(self, run, error);
+    scene_kriging_init(&self->kriging, self->hurst, self->aspect);
     for (int64_t s = (INT64_C(1) << self->framework->lattice_log) / 2; status == TL_OK && s > 0; s /= 2)
         status = fill_stage(self, s, run, error);
     return status;
-}
-
-/* Exponent and delta, where they are not given: the framework's own, else measured. */
-static tl_status choose_model(filler *self, const tl_restore_options *o, tl_error *error)
-{
-    const tl_framework *framework = self->framework;
-    tl_roughness found = {.measurable = false};
-    bool measures = !(o->hurst_given && o->delta_given) && framework->hurst == 0 && self->dem;
-    tl_status status = measures ? tl_roughness_measure(self->dem, o->run, &found, error) : TL_OK;
-    if (status != TL_OK)
-        return status;
-    self->hurst = framework->hurst > 0 ? framework->hurst : found.measurable ? found.hurst : 0.5;
-    if (o->hurst_given)
-        self->hurst = o->hurst;
-    self->hurst = fmin(fmax(self->hurst, FBM_HURST_MIN), FBM_HURST_MAX);
-    self->delta = framework->delta;
-    if (found.measurable)
-        self->delta = found.sigma / sqrt(fbm_detail_of_fbm(self->hurst, framework->info.type == TL_RASTER_AREA));
-    if (o->delta_given)
-        self->delta = o->delta;
-    if (self->delta >= 0 && self->delta <= 1e30)
-        return TL_OK;
-    return tl_fail(error, TL_ERROR_ARGUMENT, "delta must be from 0 to 1e30, not %g", self->delta);
 }
 
 static tl_status read_restored(const tl_source *source, int level, tl_window window, float *out, tl_error *error)
@@ -383,7 +456,10 @@ static tl_status describe(restored *self, const filler *by, const tl_framework *
     char bound[TL_NUMBER_TEXT], hurst[TL_NUMBER_TEXT], delta[TL_NUMBER_TEXT], seed[TL_NUMBER_TEXT];
     tl_number_text(framework->max_error, bound);
     tl_number_text(by->hurst, hurst);
-    tl_number_text(by->delta, delta);
+    if (by->delta_given)
+        tl_number_text(by->delta, delta);
+    else
+        snprintf(delta, sizeof delta, "by stage");
     snprintf(seed, sizeof seed, "%llu", (unsigned long long)by->seed);
     const tl_parameter all[] = {{"framework_max_error", bound},
                                 {"framework_hurst", hurst},
@@ -393,6 +469,19 @@ static tl_status describe(restored *self, const filler *by, const tl_framework *
     for (size_t k = 0; status == TL_OK && k < sizeof all / sizeof *all; k++)
         status = tl_parameters_add(&self->parameters, &info->parameter_count, all[k].name, all[k].value, error);
     info->parameters = self->parameters;
+    return status;
+}
+
+tl_status scene_restore_measure(const tl_framework *framework, const tl_source *dem, const tl_run *run, double *hurst,
+                                double spread[TL_STAGES], tl_error *error)
+{
+    filler self = {.framework = framework, .dem = dem, .width = dem->info.width, .height = dem->info.height};
+    self.z = tl_alloc_grid(self.width, self.height, sizeof *self.z);
+    tl_status status = self.z ? prepare(&self, run, error) : tl_fail_memory(error, "the framework's terrain");
+    *hurst = self.hurst;
+    memcpy(spread, self.spread, sizeof self.spread);
+    free(self.z);
+    free_room(&self);
     return status;
 }
 
@@ -450,11 +539,13 @@ tl_source *scene_restore(const tl_framework *framework, const tl_source *dem, co
                    .height = info->height,
                    .z = made->heights,
                    .seed = o->seed,
+                   .hurst_given = o->hurst_given,
+                   .delta_given = o->delta_given,
+                   .hurst = o->hurst,
+                   .delta = o->delta_given ? o->delta : 0,
                    .limit = framework->max_error,
                    .ignores = ignores};
-    tl_status status = choose_model(&self, o, error);
-    if (status == TL_OK)
-        status = fill(&self, o->run, error);
+    tl_status status = fill(&self, o->run, error);
     if (status == TL_OK)
         status = describe(made, &self, framework, error);
     free_room(&self);

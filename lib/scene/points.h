@@ -2,6 +2,7 @@
 #ifndef SCENE_POINTS_H
 #define SCENE_POINTS_H
 
+#include "dem/framework.h"
 #include "lib/talus.h"
 
 /* In a half step at spacing S a centre lies in the middle of a square of side S, an edge point in the middle of one of
@@ -29,6 +30,10 @@ typedef struct scene_kriging {
 void scene_kriging_init(scene_kriging *self, double hurst, double aspect);
 /* The weights where the sites with bits in `known` are known, at least one. */
 void scene_kriging_solve(const scene_kriging *self, scene_half half, uint64_t known, scene_weights *out);
+
+/* Exponent and spreads (see tl_framework) of what a framework drops of its model; its own where it has them. */
+tl_status scene_restore_measure(const tl_framework *framework, const tl_source *dem, const tl_run *run, double *hurst,
+                                double spread[TL_STAGES], tl_error *error);
 
 /* tl_framework_restore; with `ignores` it takes no notice of points that are finer than the vertex being made, which
  * shows what they are good for. */
