@@ -658,7 +658,7 @@ double fbm_position_ratio(const fbm_positions *p, int octave, double hurst, doub
 {
     size_t side = (size_t)1 << octave;
     double rows[FBM_POSITIONS] = {0}, columns[FBM_POSITIONS] = {0}, count[FBM_POSITIONS] = {0};
-    double all_rows = 0, all_columns = 0, all = 0, least = INFINITY, low = INFINITY, high = 0;
+    double all_rows = 0, all_columns = 0, all = 0, least = HUGE_VAL, low = HUGE_VAL, high = 0;
     for (size_t k = 0; k < FBM_POSITIONS; k++) {
         size_t to = k / 8 % side * side + k % 8 % side;
         rows[to] += p->rows[k];
@@ -679,5 +679,5 @@ double fbm_position_ratio(const fbm_positions *p, int octave, double hurst, doub
         return 0;
     double z = exceeded_by(0.005 / (double)(side * side));
     *limit = exp(2 * z * sqrt(position_variance(hurst, (int)side) / least));
-    return low > 0 ? high / low : (double)INFINITY;
+    return low > 0 ? high / low : HUGE_VAL;
 }

@@ -274,6 +274,41 @@ static void octavesKnowTheirSupport(void **state)
     free(z);
 }
 
+/* Means over 8 x 8 points, as cells: H and delta of the points come back, delta over a cell. The means of points differ
+ * from those of cells by a 64th of the smoothing, less than the error. */
+static void cellMeansTellOfTheirPoints(void **state)
+{
+    (void)state;
+    enum { CELLS = 65, PART = 8, N = CELLS * PART };
+    double sum[2] = {0, 0};
+    int n = 0;
+    for (int h = 0; h < 3; h++) {
+        double hurst = exponents[2 * h];
+        float *z = surface(N, hurst, 1, 20 + (uint64_t)h), *means = malloc(CELLS * CELLS * sizeof *means);
+        assert_non_null(means);
+        for (int k = 0; k < CELLS * CELLS; k++) {
+            double total = 0;
+            for (int p = 0; p < PART * PART; p++)
+                total += (double)z[(k / CELLS * PART + p / PART) * N + k % CELLS * PART + p % PART];
+            means[k] = (float)(total / (PART * PART));
+        }
+        tl_source_info info = info_of(CELLS, CELLS);
+        info.type = TL_RASTER_AREA;
+        tl_statistics s = measure_as(means, &info, 1);
+        const tl_fbm_estimate *e = &s.estimates[0];
+        assert_null(e->refusal);
+        sum[0] += pow((e->hurst - hurst) / e->hurst_error, 2);
+        if (e->delta_known)
+            sum[1] += pow((e->delta / pow(PART, hurst) - 1) * e->delta / e->delta_error, 2);
+        n++;
+        free(z);
+        free(means);
+    }
+    print_message("H %.1f, delta %.1f for %d\n", sum[0], sum[1], n);
+    assert_true(sum[0] < chi_square_limit(n, once_in_ten_thousand));
+    assert_true(sum[1] < chi_square_limit(n, once_in_ten_thousand));
+}
+
 /* ---- small, flat and void ---- */
 
 static void nothingIsMadeOfNothing(void **state)
@@ -432,21 +467,14 @@ static void plotsAreDrawn(void **state)
 int main(void)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(estimatesKeepTheirErrors),
-        cmocka_unit_test(roundingIsTakenOff),
-        cmocka_unit_test(hiddenIncrementsAreRefused),
-        cmocka_unit_test(floatsRoundToo),
-        cmocka_unit_test(hugeHeightsScale),
-        cmocka_unit_test(voidsAreLeftOut),
-        cmocka_unit_test(anisotropyIsTold),
-        cmocka_unit_test(interpolatedSamplesAreFound),
-        cmocka_unit_test(spikesAreNotGaussian),
-        cmocka_unit_test(octavesKnowTheirSupport),
-        cmocka_unit_test(nothingIsMadeOfNothing),
-        cmocka_unit_test(expectationsAreJudged),
-        cmocka_unit_test(threadsDoNotMatter),
-        cmocka_unit_test(mapsTellLocalStatistics),
-        cmocka_unit_test(plotsAreDrawn),
+        cmocka_unit_test(estimatesKeepTheirErrors),   cmocka_unit_test(roundingIsTakenOff),
+        cmocka_unit_test(hiddenIncrementsAreRefused), cmocka_unit_test(floatsRoundToo),
+        cmocka_unit_test(hugeHeightsScale),           cmocka_unit_test(voidsAreLeftOut),
+        cmocka_unit_test(anisotropyIsTold),           cmocka_unit_test(interpolatedSamplesAreFound),
+        cmocka_unit_test(spikesAreNotGaussian),       cmocka_unit_test(octavesKnowTheirSupport),
+        cmocka_unit_test(cellMeansTellOfTheirPoints), cmocka_unit_test(nothingIsMadeOfNothing),
+        cmocka_unit_test(expectationsAreJudged),      cmocka_unit_test(threadsDoNotMatter),
+        cmocka_unit_test(mapsTellLocalStatistics),    cmocka_unit_test(plotsAreDrawn),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }

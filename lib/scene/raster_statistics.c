@@ -303,7 +303,7 @@ static tl_fbm_estimate estimate_of(const char *name, const fbm_fit *fit, int ord
     e.delta_known = fit->refusal == FBM_FIT_GOOD;
     e.delta = fit->delta;
     e.delta_error = fit->delta_error;
-    e.misfit = fit->misfit;
+    e.misfit = order == 2 ? fit->misfit : 0; /* of first-order increments it is meaningless beside their ridge */
     return e;
 }
 
