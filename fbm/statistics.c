@@ -16,19 +16,47 @@ typedef struct lanes {
     double count[LANES], first[LANES], second[LANES], third[LANES], fourth[LANES];
 } lanes;
 
-static void add_row(const float *a, const float *b, const float *c, size_t count, lanes *sum)
+static inline double increment_at(const float *a, const float *b, const float *c, size_t k)
 {
-    for (size_t k = 0; k < count; k++) {
-        double v = c ? ((double)a[k] - (double)b[k]) + ((double)c[k] - (double)b[k]) : (double)b[k] - (double)a[k];
-        bool known = v - v == 0; /* neither NaN nor infinite */
-        double d = known ? v : 0, square = d * d;
-        size_t lane = k % LANES;
-        sum->count[lane] += known;
+    return c ? ((double)a[k] - (double)b[k]) + ((double)c[k] - (double)b[k]) : (double)b[k] - (double)a[k];
+}
+
+static inline void add_one(double v, bool shape, size_t lane, lanes *sum)
+{
+    bool known = v - v == 0; /* neither NaN nor infinite */
+    double d = known ? v : 0, square = d * d;
+    sum->count[lane] += known ? 1 : 0;
+    sum->second[lane] += square;
+    if (shape) {
         sum->first[lane] += d;
-        sum->second[lane] += square;
         sum->third[lane] += square * d;
         sum->fourth[lane] += square * square;
     }
+}
+
+/* `shape` and whether c is NULL are known to callers, so that each of them gets a loop of its own. */
+static inline void add_row(const float *a, const float *b, const float *c, size_t count, bool shape, lanes *sum)
+{
+    lanes own = *sum; /* in registers */
+    size_t k = 0;
+    for (; k + LANES <= count; k += LANES)
+        for (size_t lane = 0; lane < LANES; lane++)
+            add_one(increment_at(a, b, c, k + lane), shape, lane, &own);
+    for (; k < count; k++)
+        add_one(increment_at(a, b, c, k), shape, k % LANES, &own);
+    *sum = own;
+}
+
+static void add_any_row(const float *a, ptrdiff_t step, int order, size_t count, bool shape, lanes *sum)
+{
+    if (order == 1 && !shape)
+        add_row(a, a + step, NULL, count, false, sum);
+    else if (order == 1)
+        add_row(a, a + step, NULL, count, true, sum);
+    else if (!shape)
+        add_row(a, a + step, a + 2 * step, count, false, sum);
+    else
+        add_row(a, a + step, a + 2 * step, count, true, sum);
 }
 
 static double total(const double lane[LANES])
@@ -37,7 +65,7 @@ static double total(const double lane[LANES])
 }
 
 void fbm_increments_add(const float *heights, size_t width, size_t height, size_t lag, int order, int direction,
-                        fbm_moments *moments)
+                        bool shape, fbm_moments *moments)
 {
     size_t span = lag * (size_t)order;
     bool across = fbm_directions[direction][0] != 0, down = fbm_directions[direction][1] != 0;
@@ -50,7 +78,7 @@ void fbm_increments_add(const float *heights, size_t width, size_t height, size_
     lanes sum = {{0}, {0}, {0}, {0}, {0}};
     for (size_t y = 0; y < rows; y++) {
         const float *a = heights + (y + (rising ? span : 0)) * width;
-        add_row(a, a + step, order == 2 ? a + 2 * step : NULL, columns, &sum);
+        add_any_row(a, step, order, columns, shape, &sum);
     }
     const fbm_moments part = {(uint64_t)total(sum.count), total(sum.first), total(sum.second), total(sum.third),
                               total(sum.fourth)};

@@ -25,9 +25,10 @@ typedef struct fbm_moments {
 } fbm_moments;
 
 /* Adds the increments of one order over `lag` samples in one direction, every position in the window:
- * order 1: Z(x + h) - Z(x), order 2: Z(x) - 2 Z(x + h) + Z(x + 2h). Increments with a NaN are left out. */
+ * order 1: Z(x + h) - Z(x), order 2: Z(x) - 2 Z(x + h) + Z(x + 2h). Increments with a NaN are left out. Without
+ * `shape` only the count and the squares are summed up. */
 void fbm_increments_add(const float *heights, size_t width, size_t height, size_t lag, int order, int direction,
-                        fbm_moments *moments);
+                        bool shape, fbm_moments *moments);
 void fbm_moments_merge(fbm_moments *sum, const fbm_moments *part);
 
 /* Second-order increments over one sample, squared, by their middle's column and row modulo 8. (x, y): the window's

@@ -39,7 +39,7 @@ typedef struct mapping {
 static void measure_lags(const float *heights, size_t side, fbm_moment_table moments)
 {
     for (int value = 0; value < FBM_FIT_VALUES; value++)
-        fbm_increments_add(heights, side, side, (size_t)1 << (value / FBM_DIRECTIONS), 2, value % FBM_DIRECTIONS,
+        fbm_increments_add(heights, side, side, (size_t)1 << (value / FBM_DIRECTIONS), 2, value % FBM_DIRECTIONS, false,
                            &moments[value]);
 }
 

@@ -78,7 +78,7 @@ static void add_lags(const float *heights, size_t width, size_t height, int long
         for (size_t l = 0; l < LAGS && lags[l] <= longest; l++)
             for (int d = 0; d < FBM_DIRECTIONS; d++)
                 if ((size_t)(4 * lags[l]) <= side || lags[l] <= 2)
-                    fbm_increments_add(heights, width, height, (size_t)lags[l], order, d,
+                    fbm_increments_add(heights, width, height, (size_t)lags[l], order, d, order == 2 && lags[l] <= 8,
                                        &out->moments[order - 1][l * FBM_DIRECTIONS + (size_t)d]);
 }
 
