@@ -5,6 +5,7 @@
 #include "lib/base/georef.h"
 #include "lib/base/number.h"
 #include "lib/base/size.h"
+#include "lib/scene/cell_means.h"
 #include "lib/scene/chain.h"
 #include "lib/scene/patch.h"
 #include "lib/scene/roughness.h"
@@ -29,6 +30,7 @@ typedef struct field {
     const char *scheme;
     scene_chain chain;
     scene_terrain *terrain; /* of cell means, or the strengths of the chain's noise; NULL: neither */
+    scene_cell_means means; /* level 0: not for this field */
     float trend;            /* how far a slope goes on beyond the rim: see scene_growth */
     tl_parameter *parameters;
 } field;
@@ -127,10 +129,28 @@ static tl_status read_terrain(const field *f, int level, tl_window window, float
     return TL_OK;
 }
 
+/* Cells of an area raster whose means are kept. */
+static tl_status read_means(const field *f, int level, tl_window window, float *out, int64_t stride, tl_error *error)
+{
+    const char *name = f->dem->info.name;
+    fbm_window target = {window.x, window.y, (size_t)window.width, (size_t)window.height, (size_t)stride};
+    fbm_window support = scene_cell_means_support(&f->means, &f->chain, level, target);
+    ground g;
+    tl_status status = ground_read(f, support, &g, error);
+    if (status == TL_OK)
+        status = scene_cell_means_run(&f->means, &f->chain, level, target, &g.patch, out, name, error);
+    if (status == TL_OK && g.patch.known)
+        cut_voids(&g.patch, true, level, window, out, stride);
+    ground_free(&g);
+    return status;
+}
+
 static tl_status read_block(const field *f, int level, tl_window window, float *out, int64_t stride, tl_error *error)
 {
     if (f->terrain && !f->chain.mapped)
         return read_terrain(f, level, window, out, stride, error);
+    if (f->means.level)
+        return read_means(f, level, window, out, stride, error);
     scene_chain_target target = target_of(f, level, window, out, stride);
     fbm_window support = scene_chain_support(&f->chain, &target);
     support.stride = support.width;
@@ -358,7 +378,10 @@ static tl_status prepare(field *f, const tl_field_options *o, tl_error *error)
     if (status != TL_OK)
         return status;
     place(f, o->levels);
-    if (terrain && o->levels > 0) {
+    if (is_area(f) && !terrain && scheme == fbm_schemes && o->levels > 0)
+        status = scene_cell_means_measure(&f->chain, f->dem->info.height / 2, o->levels, &f->means, f->dem->info.name,
+                                          error);
+    if (status == TL_OK && terrain && o->levels > 0) {
         f->terrain = malloc(sizeof *f->terrain);
         if (!f->terrain)
             return tl_fail_memory(error, f->dem->info.name);
