@@ -97,10 +97,11 @@ static const tl_source *open_ground(const settings *set, const arguments *inputs
 {
     bool file = inputs->count == 1 && tl_framework_is_file(inputs->names[0]);
     *of = (ground){.dem = NULL};
-    if (file && (set->max_error_given || set->verify)) {
+    if (file && (set->max_error_given || set->common.window_given || set->common.box_given || set->common.geoid)) {
         *error = (tl_error){.status = TL_ERROR_ARGUMENT};
         snprintf(error->text, sizeof error->text,
-                 "%.300s: is a framework with a bound of its own; leave --max-error and --verify away",
+                 "%.300s: is a framework, which is taken whole with its own bound; leave --max-error, --window, --bbox "
+                 "and --geoid away",
                  inputs->names[0]);
         return NULL;
     }

@@ -136,6 +136,7 @@ static tl_status read_points(tl_framework *framework, const tl_source *heights, 
         status = tl_source_read(heights, 0, window, z, error);
         if (status == TL_OK)
             status = tl_source_read(exponents, 0, window, known, error);
+        tl_heights_clean(z, status == TL_OK ? count : 0);
         for (size_t k = 0; status == TL_OK && k < count; k++) {
             if (!isnan(z[k]))
                 tl_framework_force(framework, (int64_t)k % info->width, y + (int64_t)k / info->width);
