@@ -702,7 +702,8 @@ typedef struct tl_statistics {
      * clockwise from the grid's north, 0 ... 180), and the chance of isotropic fBm to look so. 0: not known. */
     double anisotropy, anisotropy_error, azimuth, isotropy_chance;
     /* Largest over smallest variance of second-order increments over one sample, by their middle's column and row
-     * modulo 2, 4 and 8; stationary fBm stays below the limit with a probability of 0.99. 0: not known. */
+     * modulo 2, 4 and 8; stationary increments with these tails stay below the limit with a probability of 0.99. 0: not
+     * known. */
     double positions[3], position_limits[3];
     /* Of second-order increments over normality_lag samples (the shortest at which rounding does not count; 0: not
      * known): skewness and excess kurtosis, and the chance of Gaussian fBm to depart as far: reject below 0.01, and one

@@ -365,12 +365,18 @@ static tl_status tell_normality(const tl_source_info *info, const sums *all, tl_
     return TL_OK;
 }
 
+/* Squares vary by 2 + excess kurtosis of their mean's square, 2 for Gaussian increments: heavy tails widen the limit.
+ */
 static void tell_positions(const fbm_positions *positions, tl_statistics *out)
 {
     if (out->estimates[0].refusal)
         return;
-    for (int k = 1; k <= FBM_POSITION_OCTAVES; k++)
-        out->positions[k - 1] = fbm_position_ratio(positions, k, out->estimates[0].hurst, &out->position_limits[k - 1]);
+    double tails = sqrt(fmax(1, 1 + 0.5 * (out->normality_lag == 1 ? out->kurtosis : 0)));
+    for (int k = 1; k <= FBM_POSITION_OCTAVES; k++) {
+        double limit;
+        out->positions[k - 1] = fbm_position_ratio(positions, k, out->estimates[0].hurst, &limit);
+        out->position_limits[k - 1] = limit > 0 ? pow(limit, tails) : 0;
+    }
 }
 
 static double mean_square(const fbm_moments *m)
