@@ -149,9 +149,12 @@ static double power_of_means(const variogram *v, int x, int y)
     return sum / weights;
 }
 
+/* Near exponent 1 second differences are small remainders, for which means are not known well enough; their
+ * correlations are then as those of points. */
 static bool variogram_init(variogram *v, const fbm_sampling *s, double hurst, int reach)
 {
-    *v = (variogram){.hurst = hurst, .cell_x = s->cell_x, .cell_y = s->cell_y, .area = s->area};
+    *v =
+        (variogram){.hurst = hurst, .cell_x = s->cell_x, .cell_y = s->cell_y, .area = s->area && fabs(hurst - 1) > 0.1};
     v->table = calloc((TABLE + 1) * (TABLE + 1), sizeof *v->table);
     for (int y = 0; v->table && y <= reach; y++)
         for (int x = 0; x <= reach; x++)
