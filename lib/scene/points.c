@@ -472,10 +472,21 @@ static tl_status describe(restored *self, const filler *by, const tl_framework *
     return status;
 }
 
+/* Whether what a filler takes is within the memory. */
+static tl_status fits(const tl_framework *framework, const tl_run *run, const char *work, tl_error *error)
+{
+    const tl_source_info *info = &framework->info;
+    double bytes =
+        BYTES_A_SAMPLE * (double)info->width * (double)info->height + BYTES_A_POINT * (double)framework->point_count;
+    return tl_run_fits(run, bytes, info->name, work, error);
+}
+
 tl_status scene_restore_measure(const tl_framework *framework, const tl_source *dem, const tl_run *run, double *hurst,
                                 double spread[TL_STAGES], tl_error *error)
 {
     filler self = {.framework = framework, .dem = dem, .width = dem->info.width, .height = dem->info.height};
+    if (fits(framework, run, "measuring what its framework drops", error) != TL_OK)
+        return TL_ERROR_MEMORY;
     self.z = tl_alloc_grid(self.width, self.height, sizeof *self.z);
     tl_status status = self.z ? prepare(&self, run, error) : tl_fail_memory(error, "the framework's terrain");
     *hurst = self.hurst;
@@ -522,9 +533,7 @@ tl_source *scene_restore(const tl_framework *framework, const tl_source *dem, co
     static const tl_restore_options defaults;
     const tl_restore_options *o = options ? options : &defaults;
     const tl_source_info *info = &framework->info;
-    double bytes =
-        BYTES_A_SAMPLE * (double)info->width * (double)info->height + BYTES_A_POINT * (double)framework->point_count;
-    if (tl_run_fits(o->run, bytes, info->name, "its terrain from the framework", error) != TL_OK)
+    if (fits(framework, o->run, "its terrain from the framework", error) != TL_OK)
         return NULL;
     if (dem && (dem->info.width != info->width || dem->info.height != info->height)) {
         tl_fail(error, TL_ERROR_ARGUMENT, "%s: is not the model of this framework", dem->info.name);
