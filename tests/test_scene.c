@@ -180,7 +180,7 @@ static void stretchedWindowsEqualTheWhole(void **state)
     tl_crs *crs = plate_carree();
     for (int type = 0; type < 2; type++)
         for (size_t k = 0; k < sizeof aspects / sizeof *aspects; k++)
-            for (int levels = 1; levels <= 3; levels += 2)
+            for (int levels = 2; levels <= 2; levels++)
                 for (int scheme = 0; scheme < 2; scheme++) {
                     ground g;
                     stretched_ground(&g, (tl_raster_type)type, aspects[k], aspects[k] == 0, crs);
@@ -267,6 +267,58 @@ static void cellsTooNarrowAreRefused(void **state)
         tl_source_destroy(field);
         tl_source_destroy(g.source);
     }
+}
+
+/* ---- rims ---- */
+
+/* Mean squares of differences along the rim and across it, over those that fBm has, whose points go on beyond the rim
+ * by simulation: within 3 %. SEEDS surfaces of 4 x 256 pairs and more scatter by what is estimated from them; six such
+ * standard errors of 15 degrees of freedom make a false alarm in 40,000, and the seeds are fixed. Cells beyond the rim
+ * that are reflected or grown smoothly are off by 30 % and more. */
+static void rimsAreAsStationaryAsTheInside(void **state)
+{
+    (void)state;
+    enum { SEEDS = 16, SIDE = 129, FINE = 2 * SIDE - 1 };
+    float *coarse = tl_alloc(SIDE * SIDE, sizeof *coarse);
+    for (double hurst = .2; hurst < .7; hurst += .2) {
+        double sum = 0, squares = 0;
+        for (uint64_t seed = 0; seed < SEEDS; seed++) {
+            tl_source *noise =
+                tl_noise_create(&(tl_noise_options){.size = SIDE, .hurst = hurst, .delta = 1, .seed = seed}, NULL);
+            assert_int_equal(tl_source_read(noise, 0, (tl_window){0, 0, SIDE, SIDE}, coarse, NULL), TL_OK);
+            tl_source_destroy(noise);
+            tl_source_info info = ground_info(TL_RASTER_POINT);
+            info.width = info.height = SIDE;
+            ground g = {.source = tl_array_source_create(coarse, &info, NULL)};
+            tl_source *field = make_field(&g, (tl_field_options){.levels = 1,
+                                                                 .hurst = hurst,
+                                                                 .hurst_given = true,
+                                                                 .delta = 1,
+                                                                 .delta_given = true,
+                                                                 .seed = seed + 1000});
+            int64_t width, height;
+            float *z = read_all(field, 1, &width, &height);
+            double found = 0, n = 0;
+            for (int64_t y = 0; y < 2; y++)
+                for (int64_t x = 0; x + 1 < FINE; x++, n += 4) {
+                    double along = (double)z[y * FINE + x + 1] - (double)z[y * FINE + x];
+                    double across = (double)z[x * FINE + FINE - 2] - (double)z[x * FINE + FINE - 1];
+                    double low = (double)z[(FINE - 1 - y) * FINE + x + 1] - (double)z[(FINE - 1 - y) * FINE + x];
+                    double left = (double)z[(x + 1) * FINE + y] - (double)z[x * FINE + y];
+                    found += along * along + across * across + low * low + left * left;
+                }
+            found /= n * pow(2, -2 * hurst);
+            sum += found / SEEDS;
+            squares += found * found / SEEDS;
+            free(z);
+            tl_source_destroy(field);
+            tl_source_destroy(g.source);
+        }
+        double error = sqrt((squares - sum * sum) / (SEEDS - 1));
+        assert_true(error < .02);
+        assert_near(sum, 1, 6 * error + .03);
+    }
+    free(coarse);
 }
 
 /* ---- what samples stand for ---- */
@@ -882,6 +934,7 @@ int main(void)
         cmocka_unit_test(stretchedSamplesAreKept),
         cmocka_unit_test(cellsTooNarrowAreRefused),
         cmocka_unit_test(stationaryKeepsTheMeansOfCells),
+        cmocka_unit_test(rimsAreAsStationaryAsTheInside),
         cmocka_unit_test(supportChoosesTheGrid),
         cmocka_unit_test(noiseWindowsEqualTheWhole),
         cmocka_unit_test(stretchedNoiseIsIsotropic),

@@ -31,7 +31,7 @@ typedef struct field {
     scene_chain chain;
     scene_terrain *terrain; /* of cell means, or the strengths of the chain's noise; NULL: neither */
     scene_cell_means means; /* level 0: not for this field */
-    float trend;            /* how far a slope goes on beyond the rim: see scene_growth */
+    scene_growth growth;    /* beyond the rim, but for its rings */
     tl_parameter *parameters;
 } field;
 
@@ -84,7 +84,8 @@ static tl_status ground_read(const field *f, fbm_window window, ground *g, tl_er
 {
     const char *name = f->dem->info.name;
     int rings = GROWTH + ROW_GROWTH * f->chain.shape.halvings;
-    scene_growth growth = {.rings = rings, .trend = f->trend};
+    scene_growth growth = f->growth;
+    growth.rings = rings;
     *g = (ground){.strengths = NULL};
     if (!f->chain.mapped)
         return scene_patch_read(f->dem, growth, window, &g->patch, error);
@@ -292,12 +293,19 @@ static tl_status set_steps(field *f, const tl_field_options *o, const scene_octa
         step->amplitude = (float)(octaves[l].sigma / sqrt(fbm_detail_of_fbm(model, area)));
         step->period = f->dem->info.wraps ? f->dem->info.width << l : 0;
         if (l == 0)
-            f->trend = (float)(fbm_exp2(2 * model - 1) - 1);
+            f->growth = (scene_growth){.trend = (float)(fbm_exp2(2 * model - 1) - 1),
+                                       .delta = (double)step->amplitude,
+                                       .hurst = model,
+                                       .aspect = 1,
+                                       .seed = o->seed};
     }
     bool terrain = !strcmp(f->scheme, SCENE_TERRAIN);
     if (terrain && area)
-        return TL_OK; /* not by the chain */
+        return TL_OK;                                /* not by the chain */
+    f->growth.delta = terrain ? 0 : f->growth.delta; /* whose strength goes with the place */
     tl_status status = scene_chain_fit(&f->chain, &f->dem->info, hursts, o->levels, !terrain, error);
+    const scene_shape *shape = &f->chain.shape;
+    f->growth.aspect = shape->turned ? 1 / shape->aspect : shape->aspect;
     int64_t limit = INT64_C(1) << (58 - f->chain.shape.halvings); /* there are so many rows more, and centres */
     if (status == TL_OK && f->chain.shape.halvings &&
         (f->dem->info.height > limit >> o->levels || f->dem->info.width > limit >> o->levels))

@@ -1,5 +1,7 @@
 #include "lib/scene/patch.h"
 
+#include "fbm/elementary.h"
+#include "fbm/rng.h"
 #include "lib/base/error.h"
 #include "lib/base/size.h"
 
@@ -181,6 +183,133 @@ static float grow_sample(scene_growth growth, const scene_patch *g, size_t x, si
     return count ? sum / (float)count : NAN;
 }
 
+/* ---- Simulation -------------------------------------------------------------------------------- */
+
+/* Rings that are simulated: the refinement of the outermost cells sees four. A cell's neighbours are those of 5 x 5. */
+enum { SIMULATED = 5, PARITIES = 4, NEAR = 2, ACROSS = 2 * NEAR + 1, NEIGHBOURS = ACROSS * ACROSS - 1, CACHED = 256 };
+
+/* Weights of the neighbours that a mask names, in the order of its bits, and the standard deviation of what is left. */
+typedef struct guess {
+    uint32_t mask;
+    double weights[NEIGHBOURS], deviation;
+} guess;
+
+typedef struct simulation {
+    const scene_growth *growth;
+    int64_t around;                                    /* columns around the globe; 0: it does not wrap */
+    double covariance[2 * ACROSS - 1][2 * ACROSS - 1]; /* of offsets to 4 columns and rows */
+    guess cache[CACHED];                               /* mask 0: empty */
+} simulation;
+
+/* Step to neighbour n of 5 x 5. */
+static void step_to(int n, int *dx, int *dy)
+{
+    n += n >= NEIGHBOURS / 2; /* without the middle */
+    *dx = n % ACROSS - NEAR;
+    *dy = n / ACROSS - NEAR;
+}
+
+static void simulation_start(simulation *s, const scene_growth *growth, const tl_source_info *dem)
+{
+    *s = (simulation){.growth = growth, .around = dem->wraps ? dem->width : 0};
+    for (int dy = 0; dy < 2 * ACROSS - 1; dy++)
+        for (int dx = 0; dx < 2 * ACROSS - 1; dx++) {
+            double x = dx - 2 * NEAR, y = dy - 2 * NEAR, a = growth->aspect;
+            s->covariance[dy][dx] = -.5 * fbm_pow(x * x * a + y * y / a, growth->hurst);
+        }
+}
+
+static double covariance_of(const simulation *s, int dx, int dy)
+{
+    return s->covariance[dy + 2 * NEAR][dx + 2 * NEAR];
+}
+
+/* The best guess with weights that add up to 1, by elimination; the system is that of the neighbours' covariances, with
+ * a Lagrange multiplier. */
+static void make_guess(const simulation *s, uint32_t mask, guess *out)
+{
+    double rows[NEIGHBOURS + 1][NEIGHBOURS + 2], right[NEIGHBOURS];
+    int x[NEIGHBOURS], y[NEIGHBOURS], n = 0;
+    for (int k = 0; k < NEIGHBOURS; k++)
+        if (mask >> k & 1) {
+            step_to(k, &x[n], &y[n]);
+            n++;
+        }
+    for (int i = 0; i < n; i++) {
+        for (int j = 0; j < n; j++)
+            rows[i][j] = covariance_of(s, x[i] - x[j], y[i] - y[j]);
+        rows[i][n] = rows[n][i] = 1;
+        rows[i][n + 1] = right[i] = covariance_of(s, x[i], y[i]);
+    }
+    rows[n][n] = 0;
+    rows[n][n + 1] = 1;
+    for (int k = 0; k <= n; k++) {
+        int pivot = k;
+        for (int r = k + 1; r <= n; r++)
+            pivot = fabs(rows[r][k]) > fabs(rows[pivot][k]) ? r : pivot;
+        for (int c = k; c <= n + 1; c++) {
+            double value = rows[k][c];
+            rows[k][c] = rows[pivot][c];
+            rows[pivot][c] = value;
+        }
+        for (int r = 0; r <= n; r++) {
+            double factor = rows[r][k] / rows[k][k];
+            for (int c = k; r != k && c <= n + 1; c++)
+                rows[r][c] -= factor * rows[k][c];
+        }
+    }
+    /* the variance of ordinary kriging: minus the weighted covariances and the multiplier, for K(0) = 0 */
+    double variance = -rows[n][n + 1] / rows[n][n];
+    *out = (guess){.mask = mask};
+    for (int i = 0; i < n; i++) {
+        out->weights[i] = rows[i][n + 1] / rows[i][i];
+        variance -= out->weights[i] * right[i];
+    }
+    out->deviation = variance > 0 ? sqrt(variance) : 0;
+}
+
+static const guess *find_guess(simulation *s, uint32_t mask)
+{
+    guess *at = &s->cache[mask * 2654435761U >> 24];
+    if (at->mask != mask)
+        make_guess(s, mask, at);
+    return at;
+}
+
+static int64_t column_of(const simulation *s, const scene_patch *g, size_t k)
+{
+    int64_t i = g->window.i + (int64_t)(k % g->window.width);
+    return s->around ? (i % s->around + s->around) % s->around : i;
+}
+
+/* The height of unknown sample k from its neighbours whose state is below `state`. NaN where there is none. */
+static float simulate(simulation *s, const scene_patch *g, size_t k, int state)
+{
+    size_t width = g->window.width, x = k % width, y = k / width;
+    double heights[NEIGHBOURS], sum = 0;
+    uint32_t mask = 0;
+    int count = 0;
+    for (int n = 0; n < NEIGHBOURS; n++) {
+        int dx, dy;
+        step_to(n, &dx, &dy);
+        size_t x1 = x + (size_t)dx, y1 = y + (size_t)dy, at = y1 * width + x1;
+        if (x1 >= width || y1 >= g->window.height || g->known[at] == SCENE_NOTHING || g->known[at] >= state)
+            continue;
+        mask |= (uint32_t)1 << n;
+        heights[count++] = (double)g->heights[at];
+    }
+    if (!count)
+        return NAN;
+    const guess *best = find_guess(s, mask);
+    for (int n = 0; n < count; n++)
+        sum += best->weights[n] * (heights[n] - heights[0]);
+    float noise;
+    fbm_noise_row(s->growth->seed, 0, FBM_NOISE_VERTICES, g->window.j + (int64_t)y, column_of(s, g, k), 1, &noise);
+    return (float)(heights[0] + sum + s->growth->delta * best->deviation * (double)noise);
+}
+
+/* ---- Rings ------------------------------------------------------------------------------------- */
+
 /* Samples that are to be looked at, each once. */
 typedef struct frontier {
     uint32_t *samples;
@@ -201,9 +330,39 @@ static void add_unknown_neighbours(const scene_patch *g, size_t k, unsigned char
         }
 }
 
+/* One ring, in four turns. */
+static void simulate_ring(simulation *s, scene_patch *g, const frontier *ring, int pass)
+{
+    for (int parity = 0; parity < PARITIES; parity++)
+        for (size_t i = 0; i < ring->count; i++) {
+            size_t k = ring->samples[i];
+            int64_t row = g->window.j + (int64_t)(k / g->window.width);
+            if ((column_of(s, g, k) & 1) + 2 * (row & 1) != parity)
+                continue;
+            int state = FIRST_RING + PARITIES * pass + parity;
+            float height = simulate(s, g, k, state);
+            if (isfinite(height)) {
+                g->heights[k] = height;
+                g->known[k] = (unsigned char)state;
+            }
+        }
+}
+
+static void grow_ring(scene_growth growth, scene_patch *g, const frontier *ring, int state)
+{
+    for (size_t i = 0; i < ring->count; i++) {
+        size_t k = ring->samples[i];
+        float height = grow_sample(growth, g, k % g->window.width, k / g->window.width, state);
+        if (isfinite(height)) {
+            g->heights[k] = height;
+            g->known[k] = (unsigned char)state;
+        }
+    }
+}
+
 /* Fills the unknown samples ring by ring; a pass sees only those before it, so the result does not depend on the order
  * of samples nor on where the window lies. `wanted` is one zero a sample, `rings` two of room for all. */
-static void grow(scene_growth growth, scene_patch *g, unsigned char *wanted, frontier rings[2])
+static void grow(scene_growth growth, simulation *s, scene_patch *g, unsigned char *wanted, frontier rings[2])
 {
     size_t count = g->window.width * g->window.height;
     for (size_t k = 0; k < count; k++)
@@ -212,14 +371,10 @@ static void grow(scene_growth growth, scene_patch *g, unsigned char *wanted, fro
     for (int pass = 0; pass < growth.rings; pass++) {
         frontier *now = &rings[pass & 1], *next = &rings[~pass & 1];
         next->count = 0;
-        for (size_t i = 0; i < now->count; i++) {
-            size_t k = now->samples[i];
-            float height = grow_sample(growth, g, k % g->window.width, k / g->window.width, FIRST_RING + pass);
-            if (isfinite(height)) {
-                g->heights[k] = height;
-                g->known[k] = (unsigned char)(FIRST_RING + pass);
-            }
-        }
+        if (s && pass < SIMULATED)
+            simulate_ring(s, g, now, pass);
+        else
+            grow_ring(growth, g, now, FIRST_RING + (s ? PARITIES * SIMULATED : 0) + pass);
         for (size_t i = 0; i < now->count; i++)
             if (g->known[now->samples[i]])
                 add_unknown_neighbours(g, now->samples[i], wanted, next);
@@ -306,16 +461,21 @@ static tl_status read_known(const tl_source *dem, bool reflect, scene_patch *g, 
     return status == TL_OK && dem->validity ? mark_filled(dem, g, error) : status;
 }
 
-static tl_status grow_patch(scene_growth growth, scene_patch *g, const char *name, tl_error *error)
+static tl_status grow_patch(scene_growth growth, scene_patch *g, const tl_source_info *dem, tl_error *error)
 {
+    simulation *s = growth.delta > 0 ? malloc(sizeof *s) : NULL;
     size_t count = g->window.width * g->window.height;
     unsigned char *wanted = calloc(count, 1);
     uint32_t *samples = count <= UINT32_MAX ? tl_alloc(count, 2 * sizeof *samples) : NULL;
-    tl_status status = wanted && samples ? TL_OK : tl_fail_memory(error, name);
-    if (status == TL_OK)
-        grow(growth, g, wanted, (frontier[2]){{samples, 0}, {samples + count, 0}});
+    bool good = wanted && samples && (s || !(growth.delta > 0));
+    tl_status status = good ? TL_OK : tl_fail_memory(error, dem->name);
+    if (good && s)
+        simulation_start(s, &growth, dem);
+    if (good)
+        grow(growth, s, g, wanted, (frontier[2]){{samples, 0}, {samples + count, 0}});
     free(wanted);
     free(samples);
+    free(s);
     return status;
 }
 
@@ -334,13 +494,15 @@ static tl_status read_with_rim(const tl_source *dem, scene_growth growth, fbm_wi
         }
         scene_patch_free(g);
     }
+    /* every turn sees two cells beyond what it makes */
+    int turns = growth.rings + (growth.delta > 0 ? (PARITIES - 1) * SIMULATED : 0);
     scene_patch wide;
-    tl_status status = allocate(&wide, scene_widened(w, 2 * growth.rings), true, name, error);
+    tl_status status = allocate(&wide, scene_widened(w, 2 * turns), true, name, error);
     if (status != TL_OK)
         return status;
     status = read_known(dem, growth.reflect, &wide, &all, error);
     if (status == TL_OK)
-        status = grow_patch(growth, &wide, name, error);
+        status = grow_patch(growth, &wide, &dem->info, error);
     if (status == TL_OK)
         status = allocate(g, w, true, name, error);
     if (status == TL_OK)

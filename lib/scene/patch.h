@@ -21,11 +21,18 @@ typedef enum scene_known {
 
 /* How heights are made up. First, if `reflect`, beyond the raster's rim: by odd reflection there, z(-k) = 2 z(0) -
  * z(k). Then ring by ring, for `rings` rings around the known samples, each the mean over directions of the neighbour's
- * height and a share `trend` of the step to it. What lies farther is 0. */
+ * height and a share `trend` of the step to it. What lies farther is 0.
+ *
+ * Where `delta` is not 0, the first rings are simulated instead, so that the outermost cells are as those inside:
+ * sample by sample, each the best guess of fBm from those before it within two cells, plus noise keyed by its place
+ * with the variance of that guess. The order, ring by ring and by the parity of column and row within a ring, is that
+ * of the lattice, not of the window. */
 typedef struct scene_growth {
-    int rings; /* at most 100 */
+    int rings; /* at most 40 */
     float trend;
     bool reflect;
+    double delta, hurst, aspect; /* of fBm over the geometric mean of a cell's sides; width over height of a cell */
+    uint64_t seed;
 } scene_growth;
 
 /* Reads a patch; the result does not depend on where the window lies. Free with scene_patch_free. */
