@@ -1,4 +1,4 @@
-#include "lib/scene/points.h"
+#include "lib/scene/restore.h"
 #include "lib/talus.h"
 
 #include <setjmp.h>

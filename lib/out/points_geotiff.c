@@ -14,7 +14,7 @@
 #include "lib/base/parallel.h"
 #include "lib/base/size.h"
 #include "lib/out/out.h"
-#include "lib/scene/points.h"
+#include "lib/scene/restore.h"
 
 #include <math.h>
 #include <stdio.h>

@@ -1,6 +1,6 @@
 /* Sites around a vertex that is being made, and the kriging of its height from those that are known. */
-#ifndef SCENE_POINTS_H
-#define SCENE_POINTS_H
+#ifndef SCENE_RESTORE_H
+#define SCENE_RESTORE_H
 
 #include "dem/framework.h"
 #include "lib/talus.h"

@@ -4,7 +4,7 @@
  * other gets the mean that the heights around it leave, by kriging of the coarser lattice and of the finer points that
  * are kept nearby, and keyed noise of the spread that they leave. It is then drawn towards the triangles' surface so
  * that it stays within the bound. The solutions are kept by which sites are known. */
-#include "lib/scene/points.h"
+#include "lib/scene/restore.h"
 
 #include "dem/framework.h"
 #include "fbm/elementary.h"
