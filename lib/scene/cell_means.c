@@ -140,10 +140,12 @@ static void invert(double response[SIDE][SIDE], double inverse[2 * REACH + 1][2 
             }
         memcpy(inverse, next, sizeof next);
     }
-    for (int k = 0; k < (2 * REACH + 1) * (2 * REACH + 1); k++)
-        sum += inverse[0][k];
-    for (int k = 0; k < (2 * REACH + 1) * (2 * REACH + 1); k++)
-        inverse[0][k] /= sum; /* a plateau is kept */
+    for (int y = 0; y <= 2 * REACH; y++)
+        for (int x = 0; x <= 2 * REACH; x++)
+            sum += inverse[y][x];
+    for (int y = 0; y <= 2 * REACH; y++)
+        for (int x = 0; x <= 2 * REACH; x++)
+            inverse[y][x] /= sum; /* a plateau is kept */
 }
 
 tl_status scene_cell_means_measure(const scene_chain *chain, int64_t row, int levels, scene_cell_means *out,
