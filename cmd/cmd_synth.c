@@ -110,12 +110,15 @@ static const tl_source *open_ground(const settings *set, const arguments *inputs
 {
     bool file = inputs->count == 1 && tl_framework_is_file(inputs->names[0]);
     *of = (ground){.dem = NULL};
-    if (file && (set->max_error_given || set->common.window_given || set->common.box_given || set->common.geoid)) {
+    const common *c = &set->common;
+    bool cut = c->window_given || c->box_given, kept = !c->voids || strcmp(c->voids, "keep") == 0;
+    if (file && (set->max_error_given || cut || c->geoid || c->nodata_given || c->band || !kept)) {
         *error = (tl_error){.status = TL_ERROR_ARGUMENT};
-        snprintf(error->text, sizeof error->text,
-                 "%.300s: is a framework, which is taken whole with its own bound; leave --max-error, --window, --bbox "
-                 "and --geoid away",
-                 inputs->names[0]);
+        snprintf(
+            error->text, sizeof error->text,
+            "%.300s: is a framework, which is taken whole with its own bound; leave --max-error, --window, --bbox, "
+            "--geoid, --band, --nodata and --voids away",
+            inputs->names[0]);
         return NULL;
     }
     if (file)
@@ -125,7 +128,15 @@ static const tl_source *open_ground(const settings *set, const arguments *inputs
         of->dem = of->opened.source;
         if (!of->dem || !set->max_error_given)
             return of->dem;
-        tl_framework_options options = {.max_error = set->max_error, .frame = TL_FRAME_PIXEL, .run = run};
+        double bound = set->quantum_given ? set->max_error - set->quantum / 2 : set->max_error;
+        if (bound < 0) {
+            *error = (tl_error){.status = TL_ERROR_ARGUMENT};
+            snprintf(error->text, sizeof error->text,
+                     "--height-quantum %g alone moves heights by more than --max-error %g; take a smaller quantum",
+                     set->quantum, set->max_error);
+            return NULL;
+        }
+        tl_framework_options options = {.max_error = bound, .frame = TL_FRAME_PIXEL, .run = run};
         of->framework = tl_framework_build(of->dem, &options, error);
     }
     if (!of->framework)
@@ -152,8 +163,8 @@ static void report_framework(const settings *set, const ground *of)
 
 /* The largest difference between the DEM and every `step`-th sample of `level` of a source; infinite where one of them
  * is void and the other is not. */
-static tl_status compare(const tl_source *dem, const tl_source *made, int level, int64_t step, double *worst,
-                         tl_error *error)
+static tl_status compare(const tl_source *dem, const tl_source *made, int level, int64_t step, bool rounded,
+                         double *worst, tl_error *error)
 {
     int64_t width = (dem->info.width - 1) * step + 1;
     float *rows = calloc((size_t)(dem->info.width + width), sizeof *rows), *other = rows + dem->info.width;
@@ -165,6 +176,8 @@ static tl_status compare(const tl_source *dem, const tl_source *made, int level,
             status = tl_source_read(made, level, (tl_window){0, y * step, width, 1}, other, error);
         for (int64_t x = 0; status == TL_OK && x < dem->info.width; x++) {
             double off = fabs((double)rows[x] - (double)other[x * step]);
+            if (rounded) /* a multiple of the quantum, as the nearest float */
+                off = fmax(off - fabs((double)other[x * step]) * 0x1p-24, 0);
             if (isnan(off))
                 off = isnan(rows[x]) && isnan(other[x * step]) ? 0 : HUGE_VAL;
             *worst = off > *worst ? off : *worst;
@@ -185,14 +198,17 @@ static int verify(const settings *set, const ground *of, const tl_source *field,
     progress_stage(bar, "verifying");
     const char *dot = strrchr(set->common.output, '.');
     bool grid = dot && (strcasecmp(dot, ".exr") == 0 || strcasecmp(dot, ".tif") == 0 || strcasecmp(dot, ".tiff") == 0);
-    bool points = of->dem->info.type == TL_RASTER_POINT || set->levels == 0;
+    bool points = field->info.type == TL_RASTER_POINT || set->levels == 0;
     tl_source *file = grid && points ? tl_open(set->common.output, &error) : NULL;
-    tl_status status = grid && points && !file ? TL_ERROR_IO : compare(of->dem, field, 0, 1, &inside, &error);
+    tl_status status = grid && points && !file ? TL_ERROR_IO : compare(of->dem, field, 0, 1, false, &inside, &error);
     if (status == TL_OK && file)
-        status = compare(of->dem, file, file->info.level, INT64_C(1) << set->levels, &outside, &error);
+        status =
+            compare(of->dem, file, file->info.level, INT64_C(1) << set->levels, set->quantum_given, &outside, &error);
     tl_source_destroy(file);
-    if (status != TL_OK)
+    if (status != TL_OK) {
+        unlink(set->common.output); /* a failed run leaves nothing */
         return command_failed(bar, &error);
+    }
     progress_end(bar);
     double worst = fmax(inside, outside);
     if (!(worst <= set->max_error)) {

@@ -38,17 +38,17 @@ static float wanted(tl_mip kind, int level, int64_t width, int64_t height, int64
     }
     if (kind == TL_MIP_LATTICE)
         return height_at(x << level, y << level);
-    float sum = 0;
+    double sum = 0;
     int count = 0;
     for (int k = 0; k < 4; k++) {
         int64_t u = 2 * x + (k & 1), v = 2 * y + (k >> 1);
         float z = u < w && v < h ? wanted(kind, level - 1, width, height, u, v) : NAN;
         if (!isnan(z)) {
-            sum += z;
+            sum += (double)z;
             count++;
         }
     }
-    return count ? sum / (float)count : NAN;
+    return count ? (float)(sum / count) : NAN;
 }
 
 /* The first tile of a level. */

@@ -92,11 +92,21 @@ static void append_escaped(char *to, size_t *used, const char *text)
     to[*used] = '\0';
 }
 
+static void append(char *to, size_t *used, const char *format, const char *text)
+{
+    size_t more = (size_t)snprintf(to + *used, METADATA_LIMIT - *used, format, text);
+    *used = *used + more < METADATA_LIMIT ? *used + more : METADATA_LIMIT - 1;
+}
+
+/* Leaves an item out that does not fit. */
 static void append_item(char *to, size_t *used, const char *name, const char *value)
 {
-    *used += (size_t)snprintf(to + *used, METADATA_LIMIT - *used, "  <Item name=\"talus_%.60s\">", name);
+    size_t before = *used;
+    append(to, used, "  <Item name=\"talus_%.60s\">", name);
     append_escaped(to, used, value);
-    *used += (size_t)snprintf(to + *used, METADATA_LIMIT - *used, "</Item>\n");
+    append(to, used, "%s", "</Item>\n");
+    if (*used + sizeof "</GDALMetadata>\n" > METADATA_LIMIT)
+        to[ *used = before] = '\0';
 }
 
 static bool set_metadata(TIFF *tiff, const tl_source_info *info)

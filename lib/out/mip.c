@@ -41,18 +41,18 @@ void out_mip_finish(out_mip *mip)
 /* The mean of what is known of 2 x 2 samples, fewer at the rim. */
 static float mean_of(const float *z, int64_t stride, bool right, bool below)
 {
-    float sum = 0;
+    double sum = 0;
     int count = 0;
     for (int k = 0; k < 4; k++) {
         if ((k & 1 && !right) || (k & 2 && !below))
             continue;
         float height = z[(k & 1) + (k & 2 ? stride : 0)];
         if (!isnan(height)) {
-            sum += height;
+            sum += (double)height;
             count++;
         }
     }
-    return count ? sum / (float)count : NAN;
+    return count ? (float)(sum / count) : NAN;
 }
 
 void out_mip_add(out_mip *mip, int level, tl_window window, const float *heights)

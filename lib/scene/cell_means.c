@@ -125,11 +125,12 @@ static tl_status impulse_response(const scene_cell_means *m, const scene_chain *
 }
 
 /* Richardson's iteration for an inverse of few cells: the response of averaging to points lies between 0.3 and 1 at all
- * frequencies, so it converges. */
+ * frequencies, so it converges; but for exponents below 0.1 at one level, where it stops before it grows. */
 static void invert(double response[SIDE][SIDE], double inverse[2 * REACH + 1][2 * REACH + 1])
 {
-    double next[2 * REACH + 1][2 * REACH + 1], sum = 0;
+    double next[2 * REACH + 1][2 * REACH + 1], sum = 0, last = HUGE_VAL;
     for (int round = 0; round < ROUNDS; round++) {
+        double residual = 0;
         for (int y = -REACH; y <= REACH; y++)
             for (int x = -REACH; x <= REACH; x++) {
                 double rest = x == 0 && y == 0 ? 1 : 0;
@@ -137,7 +138,11 @@ static void invert(double response[SIDE][SIDE], double inverse[2 * REACH + 1][2 
                     for (int u = -REACH; u <= REACH; u++)
                         rest -= inverse[v + REACH][u + REACH] * response[y - v + SPREAD][x - u + SPREAD];
                 next[y + REACH][x + REACH] = inverse[y + REACH][x + REACH] + rest;
+                residual += rest * rest;
             }
+        if (residual > .98 * last)
+            break;
+        last = residual;
         memcpy(inverse, next, sizeof next);
     }
     for (int y = 0; y <= 2 * REACH; y++)
