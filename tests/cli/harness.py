@@ -15,6 +15,9 @@ import time
 import traceback
 
 ROOT = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+
+# Fonts of plots stay with fontconfig; a sanitizer that looks for leaks must know.
+os.environ.setdefault("LSAN_OPTIONS", f"suppressions={ROOT}/tests/leaks.txt:print_suppressions=0")
 EXAMPLE = os.path.join(ROOT, "examples", "jacksboro.tif")
 SANITIZER = re.compile(r"AddressSanitizer|LeakSanitizer|runtime error:|ThreadSanitizer|MemorySanitizer")
 TIMEOUT = 170
