@@ -193,6 +193,30 @@ void tl_patch_frame_centres(const tl_patch *patch, int64_t s);
 /* Decides row `row` of the centres of stage s > 1, after the frame. */
 void tl_patch_decide_centres(const tl_patch *patch, int64_t s, int64_t row);
 
+static inline float tl_larger4(float a, float b, float c, float d)
+{
+    float m = a > b ? a : b, n = c > d ? c : d;
+    return m > n ? m : n;
+}
+
+/* A float that is not smaller than `error` >= 0 or infinite, without a branch: the bits of such floats are ordered as
+ * they are. */
+static inline float tl_rounded_up(double error)
+{
+    float f = (float)error;
+    uint32_t bits;
+    memcpy(&bits, &f, sizeof bits);
+    bits += (double)f < error;
+    memcpy(&f, &bits, sizeof f);
+    return f;
+}
+
+/* Whether the triangle below (or right of) an edge at `at` reaches over the rim; one that begins there is outside. */
+static inline bool tl_reaches_over(int64_t at, int64_t s, int64_t rim)
+{
+    return at < rim && at + s > rim;
+}
+
 /* Bound of the rounding error of evaluating a plane through heights of magnitude m at a sample: interpolation by
  * weights or by slopes takes at most ten roundings of terms of at most 4 m. */
 static inline double tl_plane_rounding(double magnitude)

@@ -196,43 +196,21 @@ static inline double larger(double a, double b)
     return a > b ? a : b;
 }
 
-static inline float larger4(float a, float b, float c, float d)
-{
-    float m = a > b ? a : b, n = c > d ? c : d;
-    return m > n ? m : n;
-}
-
-/* A float that is not smaller than `error` >= 0 or infinite: the bits of positive floats are ordered as they are. */
-static inline float rounded_up(double error)
-{
-    float f = (float)error;
-    int32_t bits;
-    memcpy(&bits, &f, sizeof bits);
-    bits += (double)f < error;
-    memcpy(&f, &bits, sizeof f);
-    return f;
-}
-
 /* The error of a vertex from that of its own triangles, flat where their corners are all as high, which is exact in any
  * arithmetic. */
 static inline float settle(const tl_error_block *block, double error, bool flat, int size, float children)
 {
     if (!(flat && error == 0))
         error += block->rounding;
-    float own = rounded_up(error + block->add[size]);
+    float own = tl_rounded_up(error + block->add[size]);
     return own > children ? own : children;
-}
-
-static inline bool reaches_over(int64_t at, int64_t s, int64_t rim)
-{
-    return at < rim && at + s > rim;
 }
 
 static inline float across_error(const tl_error_block *block, int64_t x, int64_t y, int64_t s, float children)
 {
     if (x > block->rim_x || y > block->rim_y)
         return NOTHING;
-    if (x + s > block->rim_x || reaches_over(y, s, block->rim_y))
+    if (x + s > block->rim_x || tl_reaches_over(y, s, block->rim_y))
         return NEEDED;
     if (isinf(children))
         return children;
@@ -247,7 +225,7 @@ static inline float down_error(const tl_error_block *block, int64_t x, int64_t y
 {
     if (x > block->rim_x || y > block->rim_y)
         return NOTHING;
-    if (y + s > block->rim_y || reaches_over(x, s, block->rim_x))
+    if (y + s > block->rim_y || tl_reaches_over(x, s, block->rim_x))
         return NEEDED;
     if (isinf(children))
         return children;
@@ -308,14 +286,14 @@ static inline __attribute__((always_inline)) void edge_rows(const tl_error_block
         const float *here = above + stride, *below = here + stride;
         for (int64_t i = 0; i < columns; i++) {
             int64_t x = (2 * i + 1) * s, y = 2 * row * s;
-            float children = larger4(above[2 * i], above[2 * i + 1], here[2 * i], here[2 * i + 1]);
+            float children = tl_larger4(above[2 * i], above[2 * i + 1], here[2 * i], here[2 * i + 1]);
             float error = across_error(block, x, y, s, children);
             block->across[row * columns + i] = error;
             put(block, x, y, error);
         }
         for (int64_t i = 0; row < rows && i <= columns; i++) {
             int64_t x = 2 * i * s, y = (2 * row + 1) * s;
-            float children = larger4(here[2 * i - 1], here[2 * i], below[2 * i - 1], below[2 * i]);
+            float children = tl_larger4(here[2 * i - 1], here[2 * i], below[2 * i - 1], below[2 * i]);
             float error = down_error(block, x, y, s, children);
             block->down[row * (columns + 1) + i] = error;
             put(block, x, y, error);
@@ -333,7 +311,7 @@ static inline __attribute__((always_inline)) void centre_rows(const tl_error_blo
         float *out = block->centres + (row + 1) * stride + 1;
         for (int64_t i = 0; i < columns; i++) {
             int64_t x = (2 * i + 1) * s, y = (2 * row + 1) * s;
-            float children = larger4(above[i], below[i], left[i], left[i + 1]);
+            float children = tl_larger4(above[i], below[i], left[i], left[i + 1]);
             out[i] = centre_error(block, x, y, s, is_rising(block, i, row, s), children);
             put(block, x, y, out[i]);
         }
@@ -422,7 +400,7 @@ static inline void sample_across(const sampler *self, int64_t y, double *restric
     if (2 * self->columns > block->rim_x)
         out[self->columns - 1] = HUGE_VAL; /* reaches over the rim */
     for (int64_t i = 0; i < self->columns; i++)
-        errors[2 * i] = rounded_up(out[i] + add);
+        errors[2 * i] = tl_rounded_up(out[i] + add);
 }
 
 static inline void sample_down(const sampler *self, int64_t y, double *out)
@@ -453,17 +431,17 @@ static inline void sample_centres(const sampler *self, int64_t row, const double
         double error = midpoint_error(self, north.even[i + turned], here.odd[i], south.even[i + 1 - turned]) + centre;
         double most = larger(larger(above[i], below[i]), larger(down[i], down[i + 1]));
         error = larger(error, most + most_add);
-        out[i] = rounded_up(self->voids && most == -HUGE_VAL ? -HUGE_VAL : error);
+        out[i] = tl_rounded_up(self->voids && most == -HUGE_VAL ? -HUGE_VAL : error);
     }
     if (2 * self->columns > block->rim_x)
         out[self->columns - 1] = NEEDED;
     for (int64_t i = 0; i < self->columns && 2 * row + 2 > block->rim_y; i++)
         out[i] = NEEDED;
     for (int64_t i = 0; i < self->columns; i++) {
-        errors[2 * i] = rounded_up(down[i] + edge);
+        errors[2 * i] = tl_rounded_up(down[i] + edge);
         errors[2 * i + 1] = out[i];
     }
-    errors[2 * self->columns] = rounded_up(down[self->columns] + edge);
+    errors[2 * self->columns] = tl_rounded_up(down[self->columns] + edge);
 }
 
 static inline __attribute__((always_inline)) void find_samples(sampler *self, bool careful, bool voids)

@@ -546,11 +546,6 @@ static void raise_by_child(const builder *self, uint32_t *key, int64_t x, int64_
     *key = child > *key ? child : *key;
 }
 
-static inline bool reaches_over(int64_t at, int64_t s, int64_t rim)
-{
-    return at < rim && at + s > rim;
-}
-
 /* Settles the vertex (x, y) of stage s: its children are `step` away, along rows and columns or along diagonals. */
 static void settle_top(const builder *self, int64_t x, int64_t y, int64_t s)
 {
@@ -561,9 +556,9 @@ static void settle_top(const builder *self, int64_t x, int64_t y, int64_t s)
     if (odd_x && odd_y)
         over = x + s > right || y + s > bottom;
     else if (odd_x)
-        over = x + s > right || reaches_over(y, s, bottom);
+        over = x + s > right || tl_reaches_over(y, s, bottom);
     else
-        over = y + s > bottom || reaches_over(x, s, right);
+        over = y + s > bottom || tl_reaches_over(x, s, right);
     uint32_t bits =
         atomic_load_explicit(&self->top[y / TL_BLOCK * self->corner_columns + x / TL_BLOCK], memory_order_relaxed);
     float error;

@@ -110,28 +110,11 @@ static void scan_down(scan *to, const float *z, int64_t s, bool left, bool right
 
 /* ---- Decisions --------------------------------------------------------------------------------- */
 
-static inline float larger4(float a, float b, float c, float d)
-{
-    float m = a > b ? a : b, n = c > d ? c : d;
-    return m > n ? m : n;
-}
-
-/* A float that is not smaller than `bound` >= 0, without a branch: the bits of floats are ordered as they are. */
-static inline float rounded_up(double bound)
-{
-    float f = (float)bound;
-    uint32_t bits;
-    memcpy(&bits, &f, sizeof bits);
-    bits += (double)f < bound;
-    memcpy(&f, &bits, sizeof f);
-    return f;
-}
-
 /* The bound of a vertex whose triangles have this error, or NEEDED. What overflowed (or is infinity less infinity)
  * compares as false, and is needed. */
 static inline float settled(double error, double limit)
 {
-    return error <= limit ? rounded_up(error) : NEEDED;
+    return error <= limit ? tl_rounded_up(error) : NEEDED;
 }
 
 /* Error of the sample z between its neighbours, with its rounding where that counts. Three equal heights are met
@@ -167,7 +150,7 @@ static inline float staged(const tl_patch *patch, double limit, float children, 
     double error = fabs(z - 0.5 * (a + b)), sum = error + (double)children;
     if (sum <= limit - patch->rounding ||
         (sum == 0 && a == b && limit >= 0)) /* the latter: children of bound 0 are flat where rounding counts */
-        return rounded_up(sum);
+        return tl_rounded_up(sum);
     return error <= limit ? NAN : NEEDED;
 }
 
@@ -176,18 +159,12 @@ static scan new_scan(const tl_patch *patch, double limit)
     return (scan){.stride = patch->stride, .limit = limit, .careful = patch->careful};
 }
 
-/* Whether the triangle below (or right of) an edge at `at` reaches over the rim; one that begins there is outside. */
-static inline bool reaches_over(int64_t at, int64_t s, int64_t rim)
-{
-    return at < rim && at + s > rim;
-}
-
 /* The horizontal edge point (x, y) of stage s. */
 static float decide_across(const tl_patch *patch, int64_t x, int64_t y, int64_t s, float children)
 {
     if (x > patch->rim_x || y > patch->rim_y)
         return NOTHING; /* its triangles reach over the rim with the square's centre, or do not exist */
-    if (x + s > patch->rim_x || reaches_over(y, s, patch->rim_y))
+    if (x + s > patch->rim_x || tl_reaches_over(y, s, patch->rim_y))
         return NEEDED;
     const float *z = patch->heights + y * patch->stride + x;
     double limit = patch->limit[tl_size_of(s, false)];
@@ -207,7 +184,7 @@ static float decide_down(const tl_patch *patch, int64_t x, int64_t y, int64_t s,
 {
     if (x > patch->rim_x || y > patch->rim_y)
         return NOTHING;
-    if (y + s > patch->rim_y || reaches_over(x, s, patch->rim_x))
+    if (y + s > patch->rim_y || tl_reaches_over(x, s, patch->rim_x))
         return NEEDED;
     const float *z = patch->heights + y * patch->stride + x;
     int64_t below = s * patch->stride;
@@ -253,14 +230,14 @@ void tl_patch_decide_edges(const tl_patch *patch, int64_t s, int64_t row)
     const float *above = patch->centres + 2 * row * stride + 1; /* the frame shifts rows and columns by one */
     const float *here = above + stride, *below = here + stride;
     for (int64_t i = 0; i < columns; i++) {
-        float children = larger4(above[2 * i], above[2 * i + 1], here[2 * i], here[2 * i + 1]);
+        float children = tl_larger4(above[2 * i], above[2 * i + 1], here[2 * i], here[2 * i + 1]);
         float bound = decide_across(patch, (2 * i + 1) * s, 2 * row * s, s, children);
         patch->across[row * columns + i] = bound;
         if (bound == NEEDED)
             mark(patch, (2 * i + 1) * s, 2 * row * s);
     }
     for (int64_t i = 0; row < rows && i <= columns; i++) {
-        float children = larger4(here[2 * i - 1], here[2 * i], below[2 * i - 1], below[2 * i]);
+        float children = tl_larger4(here[2 * i - 1], here[2 * i], below[2 * i - 1], below[2 * i]);
         float bound = decide_down(patch, 2 * i * s, (2 * row + 1) * s, s, children);
         patch->down[row * (columns + 1) + i] = bound;
         if (bound == NEEDED)
@@ -289,7 +266,7 @@ void tl_patch_decide_centres(const tl_patch *patch, int64_t s, int64_t row)
     float *out = patch->centres + (row + 1) * stride + 1;
     for (int64_t i = 0; i < columns; i++) {
         int64_t x = (2 * i + 1) * s, y = (2 * row + 1) * s;
-        float children = larger4(above[i], below[i], left[i], left[i + 1]);
+        float children = tl_larger4(above[i], below[i], left[i], left[i + 1]);
         out[i] = decide_centre(patch, x, y, s, is_rising(patch, i, row, s), children);
         if (out[i] == NEEDED && x <= patch->rim_x && y <= patch->rim_y)
             mark(patch, x, y);

@@ -323,6 +323,35 @@ static void rimsAreAsStationaryAsTheInside(void **state)
 
 /* ---- what samples stand for ---- */
 
+/* How far the finer cells of a smooth field are from the coarse ones at most. */
+static double largest_departure(const ground *g, double hurst)
+{
+    tl_source *field = make_field(
+        g, (tl_field_options){
+               .levels = 1, .scheme = "stationary", .hurst = hurst, .hurst_given = true, .delta_given = true});
+    int64_t width, height;
+    double most = 0;
+    float *heights = read_all(field, 1, &width, &height);
+    for (int64_t k = 0; k < width * height; k++)
+        most = fmax(most, fabs((double)heights[k] - (double)g->heights[k / width / 2 * WIDTH + k % width / 2]));
+    free(heights);
+    tl_source_destroy(field);
+    return most;
+}
+
+/* Where exponents are so small that averaging has hardly an inverse, its points must not ring to keep the means. */
+static void pointsOfCellMeansDoNotRing(void **state)
+{
+    (void)state;
+    ground g;
+    ground_make(&g, TL_RASTER_AREA, 0);
+    double usual = largest_departure(&g, .5);
+    assert_true(usual > 0);
+    for (double hurst = .01; hurst < .1; hurst += .01)
+        assert_true(largest_departure(&g, hurst) < 3 * usual);
+    tl_source_destroy(g.source);
+}
+
 /* Means over the cells, of heights up to 600 that are rounded to float: each by 2^-15 at most, and the mean of the
  * raster likewise. Cells of any shape, and beside voids and rims. */
 static void stationaryKeepsTheMeansOfCells(void **state)
@@ -933,6 +962,7 @@ int main(void)
         cmocka_unit_test(stretchedPlanesComeBackInPlace),
         cmocka_unit_test(stretchedSamplesAreKept),
         cmocka_unit_test(cellsTooNarrowAreRefused),
+        cmocka_unit_test(pointsOfCellMeansDoNotRing),
         cmocka_unit_test(stationaryKeepsTheMeansOfCells),
         cmocka_unit_test(rimsAreAsStationaryAsTheInside),
         cmocka_unit_test(supportChoosesTheGrid),
