@@ -645,6 +645,80 @@ typedef struct tl_noise_options {
 /* A fractional Brownian surface of size x size samples at unit spacing: S(h) = delta^2 |h|^(2 hurst). */
 TL_API tl_source *tl_noise_create(const tl_noise_options *options, tl_error *error);
 
+/* ---- Views ------------------------------------------------------------------------------------- */
+
+/* Where a picture is taken from. */
+typedef struct tl_view {
+    /* Longitude and latitude in degrees on the raster's own datum (CRS coordinates where `projected` is set, or the
+     * raster has no CRS: columns and negative rows), and metres above the datum that heights count from, or above the
+     * ground there. */
+    double eye[3];
+    bool projected;
+    bool above_ground;        /* the eye's height; `target_above_ground` is the target's */
+    bool target_given;        /* look there, and not by heading, pitch and roll */
+    bool target_above_ground; /* target[2] */
+    double target[3];         /* as eye */
+    /* Degrees: heading clockwise from north, pitch above the horizon (-90 ... 90), roll clockwise as seen from behind:
+     * the right side goes down. Roll counts with a target too. */
+    double heading, pitch, roll;
+    double fov;        /* horizontal field of view in degrees, 0.01 ... 179; 0: 60 */
+    int width, height; /* of the viewport in pixels, at most 32768; both 0: 1920 x 1080 */
+    bool flat;         /* no curvature of the Earth: heights count from the tangent plane at the eye's foot */
+    /* Share of the Earth's curvature that refraction takes off what is seen, 0 ... 0.9: 0.13 by day. */
+    double refraction;
+} tl_view;
+
+/* Ways to choose the triangles. */
+typedef enum tl_selector {
+    TL_SELECTOR_QUADTREE = 0, /* breadth first, with two queues */
+    TL_SELECTOR_CHUNK,        /* tiles with a step that is a power of two, edges rebuilt towards coarser neighbours */
+    TL_SELECTOR_ROAM,         /* triangles by falling error, from a queue */
+} tl_selector;
+
+/* Rules that leave out what cannot be seen; see tl_lod_options.keep. */
+typedef enum tl_culling {
+    TL_CULL_FRUSTUM = 1, /* beside the screen, or behind the eye */
+    TL_CULL_BACK = 2,    /* ground that looks away, by the cone of its normals */
+    TL_CULL_HORIZON = 4, /* behind the curve of the Earth */
+    TL_CULL_RIDGE = 8,   /* behind nearer ground */
+} tl_culling;
+
+enum { TL_LOD_BANDS = 32 };
+
+typedef struct tl_lod_options {
+    tl_selector selector;
+    double
+        pixel_error; /* pixels by which the picture may differ, > 0; 0: 1, or none where there is a budget or bands */
+    /* Most triangles; 0: any number. Where the pixel error does not take them all, the rest is not used. */
+    uint64_t budget;
+    /* Instead of the pixel error: within distances[k] metres cells of unit 2^k samples of the finest level, beyond
+     * the last twice as large again; rising. */
+    size_t band_count;
+    double bands[TL_LOD_BANDS];
+    int max_level; /* finest level that may be used; 0: the field's own. Negative ones are coarser than the DEM */
+    bool max_level_given;
+    unsigned keep;     /* an or of tl_culling: rules that are switched off */
+    const tl_run *run; /* its memory bounds the tiles that are kept */
+} tl_lod_options;
+
+typedef struct tl_lod_stats {
+    uint64_t triangles, vertices;
+    uint64_t visited, split;         /* nodes of the hierarchy */
+    uint64_t culled[4];              /* nodes, by rule: frustum, back, horizon, ridge */
+    uint64_t tiles_made, tiles_used; /* tiles of the field that were synthesised, and times one was asked for */
+    uint64_t samples_made;
+    uint64_t dem_blocks, dem_samples; /* blocks of the DEM that were read, and samples of windows of it */
+    int finest_level;
+    double pixel_error; /* the largest that is left, by the bounds used; infinite at distance 0 */
+    double seconds;
+} tl_lod_stats;
+
+/* The triangles of a field for a view. `field` is one of tl_field_create over `dem`, with the support of points (a
+ * vertex of one level is a vertex of all finer ones); `pyramid` is that of `dem`. Vertices are on the lattice of the
+ * field's finest level; the mesh has no cracks, and nothing where it was culled. */
+TL_API tl_status tl_select(const tl_source *field, const tl_source *dem, const tl_pyramid *pyramid, const tl_view *view,
+                           const tl_lod_options *options, tl_mesh **out, tl_lod_stats *stats, tl_error *error);
+
 /* ---- Statistics -------------------------------------------------------------------------------- */
 
 /* How like fractional Brownian motion a raster is: E|Z(x + h) - Z(x)|^2 = delta^2 |h|^(2 hurst), with h in samples (of
