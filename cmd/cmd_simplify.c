@@ -12,7 +12,7 @@ typedef struct settings {
     common common;
     double max_error; /* asked for; or what a budget comes to */
     bool max_error_given, verify;
-    int frame, mesh, borders;
+    int frame, mesh, borders, diagonal;
     double skirt, base;
     int64_t triangles, vertices; /* budgets; 0: none */
     const char *keep;
@@ -27,6 +27,10 @@ static const char *const mesh_names[] = {[TL_MESH_QUADTREE] = "quadtree", [TL_ME
 
 enum { BORDERS_FREE, BORDERS_CANONICAL };
 static const char *const border_names[] = {[BORDERS_FREE] = "free", [BORDERS_CANONICAL] = "canonical", NULL};
+
+enum { DIAGONAL_LONGEST_EDGE, DIAGONAL_LOWER };
+static const char *const diagonal_names[] = {
+    [DIAGONAL_LONGEST_EDGE] = "longest-edge", [DIAGONAL_LOWER] = "lower", NULL};
 
 enum { FEATURES_NONE, FEATURES_POINTS, FEATURES_LINES };
 static const char *const feature_names[] = {
@@ -216,6 +220,28 @@ static tl_status make_mesh(settings *set, const tl_source *dem, const tl_feature
     return tl_simplify(dem, &options, mesh, isolated, error);
 }
 
+/* Turns squares to their lower diagonals, if asked to, and tells what that does. */
+static tl_status turn_diagonals(const settings *set, const tl_source *dem, const tl_run *run, tl_mesh *mesh,
+                                tl_error *error)
+{
+    if (set->diagonal == DIAGONAL_LONGEST_EDGE)
+        return TL_OK;
+    tl_diagonal_options options = {.max_error = set->max_error,
+                                   .frame = (tl_frame)set->frame,
+                                   .rounding = tl_write_rounding(&dem->info, set->common.output, (tl_frame)set->frame),
+                                   .run = run};
+    tl_diagonal_report found;
+    tl_status status = tl_mesh_lower_diagonals(mesh, dem, &options, &found, error);
+    if (status == TL_OK)
+        command_say(&set->common,
+                    "diagonals: %llu squares, %llu low already, %llu turned, %llu held by the bound; rms error at the "
+                    "%llu samples in what was turned: %.4g, before %.4g",
+                    (unsigned long long)found.squares, (unsigned long long)found.lower,
+                    (unsigned long long)found.turned, (unsigned long long)found.held, (unsigned long long)found.samples,
+                    found.rms_after, found.rms_before);
+    return status;
+}
+
 /* ---- Features and points ---- */
 
 static void report_features(const settings *set, const tl_features *features, double samples)
@@ -291,7 +317,8 @@ static int write_mesh(settings *set, const tl_source *dem, const tl_features *fe
     tl_mesh *mesh = NULL;
     uint64_t isolated = 0;
     int status;
-    if (make_mesh(set, dem, features, run, &mesh, &isolated, &error) != TL_OK)
+    if (make_mesh(set, dem, features, run, &mesh, &isolated, &error) != TL_OK ||
+        turn_diagonals(set, dem, run, mesh, &error) != TL_OK)
         status = command_failed(bar, &error);
     else {
         double seconds = progress_end(bar);
@@ -381,6 +408,9 @@ static bool settings_ok(settings *set)
                  "leave --mesh and --borders away");
     else if ((set->points || set->features) && (set->mesh != TL_MESH_QUADTREE || set->borders != BORDERS_FREE))
         complain("--points and --features are for quadtree meshes with free borders; leave --mesh and --borders away");
+    else if (set->diagonal != DIAGONAL_LONGEST_EDGE && (set->points || set->mesh != TL_MESH_QUADTREE || set->error_map))
+        complain("--diagonal lower is for quadtree meshes under one bound; leave --mesh, --points and --max-error-map "
+                 "away");
     else if (set->features && !set->max_error_given)
         complain("--features needs --max-error E, which tells what matters");
     else if (set->points && (set->skirt > 0 || set->base > 0))
@@ -411,6 +441,10 @@ static int run(const command *self, int argc, const char **argv, bool help)
          "canonical: by the rim's samples alone, so that tiles that share them join without a crack; a tin always has "
          "these (default: free)",
          0, 0, border_names},
+        {"diagonal", 0, OPTION_CHOICE, &set.diagonal, NULL, "RULE",
+         "which way squares of two triangles are cut: longest-edge, by their place, or lower, along the lower diagonal "
+         "where the bound allows it (default: longest-edge)",
+         0, 0, diagonal_names},
         {"points", 0, OPTION_FLAG, &set.points, NULL, NULL,
          "write the points alone: .geojson, .csv, .ply, or .tif, which synth takes in place of the DEM", 0, 0, NULL},
         {"features", 0, OPTION_CHOICE, &set.features, NULL, "KIND",

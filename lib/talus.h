@@ -520,6 +520,31 @@ typedef struct tl_simplify_options {
 TL_API tl_status tl_simplify(const tl_source *dem, const tl_simplify_options *options, tl_mesh **out,
                              uint64_t *uncovered, tl_error *error);
 
+/* ---- Diagonals ------------------------------------------------------------------------------------ */
+
+typedef struct tl_diagonal_options {
+    double max_error;     /* the bound that the mesh keeps, and goes on to keep */
+    tl_frame frame;       /* as in tl_framework_options */
+    tl_rounding rounding; /* likewise */
+    const tl_run *run;
+} tl_diagonal_options;
+
+typedef struct tl_diagonal_report {
+    uint64_t squares; /* pairs of triangles that are halves of one square, upright or on a corner */
+    uint64_t lower;   /* of these, cut along the lower diagonal already, or level */
+    uint64_t turned;  /* that were cut along the higher one, and are turned */
+    uint64_t held;    /* that would break the bound, and are left */
+    uint64_t samples; /* inside of those that were turned, and their rms errors */
+    double rms_before, rms_after;
+} tl_diagonal_report;
+
+/* Cuts the squares of a mesh by longest-edge bisection along the lower of their diagonals, the one whose ends are lower
+ * in the mean, where the bound allows it: the rule of Hu and Wang's patches. `dem` is the model that the mesh was made
+ * of; samples inside of squares that are to be turned are read. `out` may be NULL. When it fails, the mesh may be
+ * turned in parts; it is a good mesh all the same. */
+TL_API tl_status tl_mesh_lower_diagonals(tl_mesh *mesh, const tl_source *dem, const tl_diagonal_options *options,
+                                         tl_diagonal_report *out, tl_error *error);
+
 /* ---- Frameworks for every bound ------------------------------------------------------------------ */
 
 /* For every sample the largest bound at which the framework still needs it: so all frameworks of an elevation model.

@@ -747,6 +747,23 @@ def simplify_keeps_its_word(case):
     expect(triangles == sorted(triangles, reverse=True), f"{triangles}")
 
 
+def diagonals_are_turned(case):
+    """Squares are cut along the lower diagonal under the same bound; what cannot be turned is refused."""
+    said = case.run("simplify", EXAMPLE, "-e", 5, "--diagonal", "lower", "--verify", "--frame", "pixel", "-o", "low.ply").err
+    numbers = re.search(r"diagonals: (\d+) squares, (\d+) low already, (\d+) turned, (\d+) held", said)
+    squares, low, turned, held = (int(number) for number in numbers.groups())
+    expect(low + turned + held == squares and turned > 1000 and held > 100, said)
+    expect(float(re.search(r"largest error ([\d.e+-]+) at", said).group(1)) <= 5, said)
+    case.run("simplify", EXAMPLE, "-e", 5, "-q", "--frame", "pixel", "-o", "plain.ply")
+    low, plain = read_ply(case.path("low.ply")), read_ply(case.path("plain.ply"))
+    expect(low.positions == plain.positions and len(low.indices) == len(plain.indices), "vertices changed")
+    expect(faces_down(low, 2) == 0, "folded triangles")
+    changed = sum(low.indices[t:t + 3] != plain.indices[t:t + 3] for t in range(0, len(low.indices), 3))
+    expect(changed == 2 * turned, f"{changed} triangles changed")
+    refused = case.run("simplify", EXAMPLE, "-e", 5, "--diagonal", "lower", "--mesh", "tin", "-o", "x.ply", status=2).err
+    expect("--diagonal lower is for quadtree meshes" in refused, refused)
+
+
 # ---- the manuals ----
 
 def commands_in_readme():
@@ -941,7 +958,7 @@ TESTS = [
     names_of_any_bytes,
     formats_hold_the_same_heights, png_within_half_a_step, point_samples_are_kept, point_samples_of_the_andes_are_kept,
     area_means_stay_on_their_footprint,
-    glb_is_in_metres, frames_agree, simplify_keeps_its_word,
+    glb_is_in_metres, frames_agree, simplify_keeps_its_word, diagonals_are_turned,
     manuals_show_what_works, man_page_knows_every_option,
     memory_does_not_grow_with_the_output, memory_stays_within_what_is_given, bad_files_end_with_one_line,
     gdal_reads_the_geotiff, gdal_places_the_example, openexr_reads_the_exr, openimageio_agrees_on_the_range,
