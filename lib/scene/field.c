@@ -1,4 +1,5 @@
 /* The fractal field over an elevation model, as a source. */
+#include "lib/scene/field.h"
 #include "fbm/elementary.h"
 #include "fbm/estimate.h"
 #include "lib/base/error.h"
@@ -32,6 +33,7 @@ typedef struct field {
     scene_terrain *terrain; /* of cell means, or the strengths of the chain's noise; NULL: neither */
     scene_cell_means means; /* level 0: not for this field */
     scene_growth growth;    /* beyond the rim, but for its rings */
+    double deltas[SCENE_LEVEL_MAX + 1], hursts[SCENE_LEVEL_MAX + 1]; /* see scene_field_fractal */
     tl_parameter *parameters;
 } field;
 
@@ -291,6 +293,8 @@ static tl_status set_steps(field *f, const tl_field_options *o, const scene_octa
         fbm_step *step = &f->chain.steps[l];
         hursts[l] = model;
         step->amplitude = (float)(octaves[l].sigma / sqrt(fbm_detail_of_fbm(model, area)));
+        f->deltas[l] = (double)step->amplitude;
+        f->hursts[l] = model;
         step->period = f->dem->info.wraps ? f->dem->info.width << l : 0;
         if (l == 0)
             f->growth = (scene_growth){.trend = (float)(fbm_exp2(2 * model - 1) - 1),
@@ -427,4 +431,65 @@ tl_source *tl_field_create(const tl_source *dem, const tl_field_options *options
         return &f->source;
     field_destroy(&f->source);
     return NULL;
+}
+
+/* ---- For those who choose what of it is needed ---- */
+
+static const field *as_field(const tl_source *source)
+{
+    return source->read == field_read ? (const field *)source : NULL;
+}
+
+const tl_source *scene_field_dem(const tl_source *source)
+{
+    const field *f = as_field(source);
+    return f ? f->dem : NULL;
+}
+
+bool scene_field_nests(const tl_source *source)
+{
+    const field *f = as_field(source);
+    return f && !is_area(f) && !f->chain.steps[0].scheme->moves;
+}
+
+void scene_field_fractal(const tl_source *source, int level, double *delta, double *hurst)
+{
+    const field *f = as_field(source);
+    *delta = f->deltas[level];
+    *hurst = f->hursts[level];
+}
+
+tl_status scene_field_strengths(const tl_source *source, tl_window window, float *out, tl_error *error)
+{
+    const field *f = as_field(source);
+    size_t count = (size_t)(window.width * window.height);
+    for (size_t k = 0; k < count; k++)
+        out[k] = 1;
+    if (!f->chain.mapped)
+        return TL_OK;
+    ground g;
+    fbm_window from = {window.x, window.y, (size_t)window.width, (size_t)window.height, (size_t)window.width};
+    tl_status status = ground_read(f, from, &g, error);
+    if (status == TL_OK)
+        memcpy(out, g.strengths, count * sizeof *out);
+    ground_free(&g);
+    return status;
+}
+
+tl_window scene_field_support(const tl_source *source, int level, tl_window window)
+{
+    const field *f = as_field(source);
+    fbm_window from = {window.x, window.y, (size_t)window.width, (size_t)window.height, (size_t)window.width};
+    if (level > 0) {
+        scene_chain_target target = target_of(f, level, window, NULL, window.width);
+        from = scene_chain_support(&f->chain, &target);
+    }
+    if (f->chain.mapped)
+        from = scene_widened(from, FBM_ENERGY_MARGIN);
+    int64_t right = tl_int64_min(from.i + (int64_t)from.width, f->dem->info.width);
+    int64_t bottom = tl_int64_min(from.j + (int64_t)from.height, f->dem->info.height);
+    tl_window out = {tl_int64_max(from.i, 0), tl_int64_max(from.j, 0), 0, 0};
+    out.width = tl_int64_max(right - out.x, 0);
+    out.height = tl_int64_max(bottom - out.y, 0);
+    return out;
 }
