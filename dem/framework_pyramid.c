@@ -177,9 +177,9 @@ static tl_status look_at_block(void *context, tl_parallel *loop, uint64_t item, 
     found->magnitude = tl_heights_magnitude(&of, &found->voids);
     found->hash = hash_block(own->read, &at, tl_int64_min(self->side, self->width - at.x),
                              tl_int64_min(self->side, self->height - at.y));
+    find_range(own->read, of.width * of.height, found);
     if (self->only_looks)
         return TL_OK;
-    find_range(own->read, of.width * of.height, found);
     found->rounds = tl_heights_round(&of, found->magnitude, self->shape->lattice_log);
     store_corners(self, &at, own->read);
     return shifts(self) ? look_at_rises(self, &at, own, error) : TL_OK;
@@ -687,6 +687,10 @@ static tl_status look(builder *self, tl_error *error)
         return status;
     sum_facts(self);
     self->pyramid->checksum = hash_frame(self, self->all.hash);
+    for (uint64_t k = 0; k < blocks; k++) {
+        self->pyramid->ranges[2 * k] = self->facts[k].low;
+        self->pyramid->ranges[2 * k + 1] = self->facts[k].high;
+    }
     self->pyramid->shape->voids = self->all.voids;
     return TL_OK;
 }
@@ -731,7 +735,9 @@ tl_pyramid *tl_pyramid_allocate(const tl_source_info *info, const tl_pyramid_opt
         pyramid->bends = dem_frame_bends(&info->georef, options->frame);
         pyramid->codes = options->exact ? NULL : calloc(count, 1);
         pyramid->errors = options->exact ? calloc(count, sizeof *pyramid->errors) : NULL;
-        if (pyramid->codes || pyramid->errors)
+        size_t blocks = (size_t)(pyramid->shape->columns * pyramid->shape->rows);
+        pyramid->ranges = tl_alloc(blocks, 2 * sizeof *pyramid->ranges);
+        if ((pyramid->codes || pyramid->errors) && pyramid->ranges)
             return pyramid;
         tl_fail(error, TL_ERROR_MEMORY, "%s: not enough memory for the errors of its %lld x %lld samples", info->name,
                 (long long)info->width, (long long)info->height);
@@ -792,5 +798,6 @@ void tl_pyramid_destroy(tl_pyramid *pyramid)
     tl_framework_destroy(pyramid->shape);
     free(pyramid->codes);
     free(pyramid->errors);
+    free(pyramid->ranges);
     free(pyramid);
 }

@@ -14,6 +14,7 @@ struct tl_pyramid {
     float *errors;
     int32_t base;      /* of the codes: see tl_error_kernel */
     uint64_t checksum; /* of the DEM's heights */
+    float *ranges;     /* lowest and highest height of each of the shape's blocks, rims included; low > high: void */
 };
 
 /* Keys are codes, or the bits of errors: ordered as errors are. */
