@@ -19,6 +19,12 @@ typedef struct scene_view scene_view;
 scene_view *scene_view_create(const tl_view *view, const tl_source *dem, tl_error *error);
 void scene_view_destroy(scene_view *view);
 
+/* What is known of the ground sharpens the rules below: no sample is lower than `lowest` (in the raster's unit; else
+ * what no ground of a planet is), and where it has no voids, ridges hide what is behind them. Before the view is used
+ * by several threads. */
+enum { SCENE_LOWEST_GROUND = -11500 }; /* metres */
+void scene_view_know_ground(scene_view *view, double lowest, bool has_holes);
+
 /* The eye, and the way from the frame to pixels. */
 const scene_camera *scene_view_camera(const scene_view *view);
 /* Places of n points; any number of threads. Curvature and refraction count. */
