@@ -19,6 +19,8 @@ typedef struct settings {
     double share; /* of the samples, by --keep; 0: none */
     const char *error_cache;
     const char *error_map;
+    opened_input map;
+    double bound_of_voids; /* of the map: what was asked for, or -1 */
     bool points;
     int features; /* index into feature_names */
 } settings;
@@ -38,6 +40,13 @@ static const char *const feature_names[] = {
 
 static int report_check(const settings *set, const tl_mesh_report *check)
 {
+    if (check->exceeding) {
+        complain("%s: %llu samples are above their bounds, by %.3g at column %lld, row %lld; that is a fault of talus, "
+                 "please report it",
+                 set->common.output, (unsigned long long)check->exceeding, check->max_excess, (long long)check->worst_i,
+                 (long long)check->worst_j);
+        return EXIT_FAILED;
+    }
     if (!(check->max_error <= set->max_error)) {
         complain(
             "%s: its numbers are %.3g more than %.9g from the DEM at column %lld, row %lld; if they are too coarse "
@@ -80,7 +89,9 @@ static int write_and_check(const settings *set, const tl_source *dem, tl_mesh *m
         return EXIT_DONE;
     progress_stage(bar, "verifying");
     int status = EXIT_DONE;
-    if (tl_mesh_verify_file(set->common.output, mesh, dem, options.frame, run, &check, &error) != TL_OK)
+    tl_selection bounds = {.max_error = set->bound_of_voids, .max_error_map = set->map.source};
+    if (tl_mesh_verify_file(set->common.output, mesh, dem, set->error_map ? &bounds : NULL, options.frame, run, &check,
+                            &error) != TL_OK)
         status = command_failed(bar, &error);
     progress_end(bar);
     status = status == EXIT_DONE ? report_check(set, &check) : status;
@@ -166,23 +177,13 @@ static tl_framework *select_framework(const settings *set, const tl_source *dem,
                                                          : (uint64_t)set->vertices,
                               .features = features,
                               .run = run};
-    opened_input map = {0};
     if (set->error_map) {
-        char *name = (char *)set->error_map;
-        common plain = set->common; /* the map has bounds, not heights */
-        plain.voids = plain.geoid = NULL;
-        plain.nodata_given = false, plain.band = 0;
-        map = command_open(&plain, &(arguments){.names = &name, .count = 1}, run, error);
-        if (!map.source)
-            return NULL;
-        selection.max_error_map = map.source;
-        selection.max_error = set->max_error_given ? set->max_error : -1;
+        selection.max_error_map = set->map.source;
+        selection.max_error = set->bound_of_voids;
     }
     tl_pyramid *pyramid = make_pyramid(set, dem, run, error);
     tl_framework *framework = pyramid ? tl_framework_from_pyramid(pyramid, dem, &selection, error) : NULL;
     tl_pyramid_destroy(pyramid);
-    if (set->error_map)
-        command_close(&map);
     return framework;
 }
 
@@ -330,6 +331,20 @@ static int write_mesh(settings *set, const tl_source *dem, const tl_features *fe
     return status;
 }
 
+/* The map of bounds, which are not heights. */
+static tl_status open_map(settings *set, const tl_run *run, tl_error *error)
+{
+    if (!set->error_map)
+        return TL_OK;
+    char *name = (char *)set->error_map;
+    common plain = set->common;
+    plain.voids = plain.geoid = NULL;
+    plain.nodata_given = false, plain.band = 0;
+    set->map = command_open(&plain, &(arguments){.names = &name, .count = 1}, run, error);
+    set->bound_of_voids = set->max_error_given ? set->max_error : -1;
+    return set->map.source ? TL_OK : error->status;
+}
+
 static int simplify(settings *set, const arguments *inputs)
 {
     progress bar;
@@ -347,12 +362,13 @@ static int simplify(settings *set, const arguments *inputs)
     progress_stage(&bar, "simplifying");
     tl_features *features = NULL;
     int status;
-    if (find_features(set, dem, &run, &features, &error) != TL_OK)
+    if (open_map(set, &run, &error) != TL_OK || find_features(set, dem, &run, &features, &error) != TL_OK)
         status = command_failed(&bar, &error);
     else
         status =
             set->points ? write_points(set, dem, features, &run, &bar) : write_mesh(set, dem, features, &run, &bar);
     tl_features_destroy(features);
+    command_close(&set->map);
     command_close(&opened);
     return status;
 }

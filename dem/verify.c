@@ -15,9 +15,9 @@
 enum { BAND_SAMPLES = 1 << 16, MAX_SIDE = 1 << 30 };
 
 typedef struct band_result {
-    double worst, squares;
-    int64_t i, j;
-    uint64_t samples, uncovered;
+    double worst, squares, excess;
+    int64_t i, j, over_i, over_j; /* of the worst, and of the largest excess */
+    uint64_t samples, uncovered, exceeding;
 } band_result;
 
 /* A sample in space: where its ground is, and which way is up there. */
@@ -30,17 +30,19 @@ typedef struct verifier {
     const tl_source *source;
     int64_t width, height, band_rows;
     size_t bands;
-    size_t *first;            /* where the triangles of a band begin in `triangles`; bands + 1 */
-    uint32_t *triangles;      /* by band, every triangle in each band that it reaches */
-    float **heights;          /* by worker: the band's samples */
-    double **errors;          /* and the largest error of each, negative where no triangle covers it */
-    band_result *results;     /* by band */
-    const dem_placed *placed; /* NULL: vertices are at their samples */
-    bool bent;                /* the rest is for frames where the lattice is bent: */
-    place *corners;           /* of the mesh, by vertex; only `at` */
-    place **places;           /* by worker: the band's samples */
-    double **beside;          /* and the error of each on the lattice's triangle, for those beside all flat ones */
-    dem_space **spaces;       /* by worker */
+    size_t *first;              /* where the triangles of a band begin in `triangles`; bands + 1 */
+    uint32_t *triangles;        /* by band, every triangle in each band that it reaches */
+    float **heights;            /* by worker: the band's samples */
+    double **errors;            /* and the largest error of each, negative where no triangle covers it */
+    float **limits;             /* and their bounds; NULL: the same for all */
+    const tl_selection *bounds; /* NULL: none */
+    band_result *results;       /* by band */
+    const dem_placed *placed;   /* NULL: vertices are at their samples */
+    bool bent;                  /* the rest is for frames where the lattice is bent: */
+    place *corners;             /* of the mesh, by vertex; only `at` */
+    place **places;             /* by worker: the band's samples */
+    double **beside;            /* and the error of each on the lattice's triangle, for those beside all flat ones */
+    dem_space **spaces;         /* by worker */
 } verifier;
 
 static const tl_vertex *corner(const verifier *self, size_t triangle, int k)
@@ -293,8 +295,22 @@ static void compare_bent_band(const verifier *self, size_t item, unsigned worker
 
 /* ---- One band of rows ------------------------------------------------------------------------------ */
 
+/* Compares with the sample's own bound. */
+static void hold_to(const verifier *self, double error, const float *limits, int64_t at, int64_t top, band_result *out)
+{
+    double limit = limits && !isnan(limits[at]) ? (double)limits[at] : self->bounds->max_error;
+    if (error <= limit)
+        return;
+    out->exceeding++;
+    if (error - limit > out->excess) {
+        out->excess = error - limit;
+        out->over_i = at % self->width;
+        out->over_j = top + at / self->width;
+    }
+}
+
 static void sum_up(const verifier *self, int64_t top, int64_t rows, const float *heights, const double *errors,
-                   band_result *out)
+                   const float *limits, band_result *out)
 {
     *out = (band_result){.worst = -1, .i = -1, .j = -1};
     for (int64_t at = 0; at < rows * self->width; at++) {
@@ -306,6 +322,8 @@ static void sum_up(const verifier *self, int64_t top, int64_t rows, const float 
         }
         out->samples++;
         out->squares += errors[at] * errors[at];
+        if (self->bounds)
+            hold_to(self, errors[at], limits, at, top, out);
         if (errors[at] > out->worst) {
             out->worst = errors[at];
             out->i = at % self->width;
@@ -323,6 +341,10 @@ static tl_status verify_band(void *context, tl_parallel *loop, uint64_t item, un
     double *errors = self->errors[worker];
     tl_window window = {0, top, self->width, rows};
     tl_status status = tl_source_read(self->source, self->source->info.level, window, heights, error);
+    float *limits = self->limits ? self->limits[worker] : NULL;
+    if (status == TL_OK && limits)
+        status =
+            tl_source_read(self->bounds->max_error_map, self->bounds->max_error_map->info.level, window, limits, error);
     if (status != TL_OK)
         return status;
     for (int64_t at = 0; at < rows * self->width; at++)
@@ -331,7 +353,7 @@ static tl_status verify_band(void *context, tl_parallel *loop, uint64_t item, un
         compare_bent_band(self, (size_t)item, worker, top, rows);
     for (size_t at = self->first[item]; !self->bent && at < self->first[item + 1]; at++)
         compare_triangle(self, self->triangles[at], top, top + rows - 1, heights, errors);
-    sum_up(self, top, rows, heights, errors, &self->results[item]);
+    sum_up(self, top, rows, heights, errors, limits, &self->results[item]);
     return TL_OK;
 }
 
@@ -402,10 +424,16 @@ static bool make_scratch(verifier *self, unsigned workers)
     self->errors = calloc(workers, sizeof *self->errors);
     self->first = calloc(self->bands + 1, sizeof *self->first);
     self->results = calloc(self->bands, sizeof *self->results);
+    bool mapped = self->bounds && self->bounds->max_error_map;
+    self->limits = mapped ? calloc(workers, sizeof *self->limits) : NULL;
+    if (mapped && !self->limits)
+        return false;
     for (unsigned i = 0; self->heights && self->errors && i < workers; i++) {
         self->heights[i] = tl_alloc_grid(self->width, self->band_rows, sizeof **self->heights);
         self->errors[i] = tl_alloc_grid(self->width, self->band_rows, sizeof **self->errors);
-        if (!self->heights[i] || !self->errors[i])
+        if (mapped)
+            self->limits[i] = tl_alloc_grid(self->width, self->band_rows, sizeof **self->limits);
+        if (!self->heights[i] || !self->errors[i] || (mapped && !self->limits[i]))
             return false;
     }
     return self->heights && self->errors && self->first && self->results;
@@ -465,12 +493,28 @@ static void free_scratch(verifier *self, unsigned workers)
             free(self->heights[i]);
         if (self->errors)
             free(self->errors[i]);
+        if (self->limits)
+            free(self->limits[i]);
     }
+    free(self->limits);
     free(self->heights);
     free(self->errors);
     free(self->first);
     free(self->triangles);
     free(self->results);
+}
+
+static void merge_excess(const verifier *self, tl_mesh_report *out)
+{
+    for (size_t band = 0; band < self->bands; band++) {
+        const band_result *each = &self->results[band];
+        out->exceeding += each->exceeding;
+        if (each->excess > out->max_excess) {
+            out->max_excess = each->excess;
+            out->worst_i = each->over_i;
+            out->worst_j = each->over_j;
+        }
+    }
 }
 
 static tl_mesh_report merge(const verifier *self)
@@ -489,6 +533,7 @@ static tl_mesh_report merge(const verifier *self)
         }
     }
     out.rms_error = out.samples ? sqrt(squares / (double)out.samples) : 0;
+    merge_excess(self, &out);
     return out;
 }
 
@@ -501,15 +546,32 @@ tl_status tl_mesh_verify(const tl_mesh *mesh, const tl_source *source, const tl_
 tl_status tl_mesh_verify_in(const tl_mesh *mesh, const tl_source *source, tl_frame frame, const tl_run *run,
                             tl_mesh_report *out, tl_error *error)
 {
-    return dem_verify_placed(mesh, NULL, source, frame, run, out, error);
+    return dem_verify_placed(mesh, NULL, source, NULL, frame, run, out, error);
 }
 
-tl_status dem_verify_placed(const tl_mesh *mesh, const dem_placed *placed, const tl_source *source, tl_frame frame,
-                            const tl_run *run, tl_mesh_report *out, tl_error *error)
+static tl_status check_bounds(const verifier *self, tl_error *error)
 {
-    verifier self = {
-        .mesh = mesh, .placed = placed, .source = source, .width = source->info.width, .height = source->info.height};
+    const tl_source *map = self->bounds ? self->bounds->max_error_map : NULL;
+    if (!map || (map->info.width == self->width && map->info.height == self->height))
+        return TL_OK;
+    return tl_fail(error, TL_ERROR_DATA, "%s: %lld x %lld bounds for the %lld x %lld samples of %s; give one for each",
+                   map->info.name, (long long)map->info.width, (long long)map->info.height, (long long)self->width,
+                   (long long)self->height, self->source->info.name);
+}
+
+tl_status dem_verify_placed(const tl_mesh *mesh, const dem_placed *placed, const tl_source *source,
+                            const tl_selection *bounds, tl_frame frame, const tl_run *run, tl_mesh_report *out,
+                            tl_error *error)
+{
+    verifier self = {.mesh = mesh,
+                     .placed = placed,
+                     .source = source,
+                     .bounds = bounds,
+                     .width = source->info.width,
+                     .height = source->info.height};
     tl_status status = check_mesh(&self, error);
+    if (status == TL_OK)
+        status = check_bounds(&self, error);
     if (status != TL_OK)
         return status;
     self.band_rows = tl_int64_min(self.height, tl_int64_max(8, BAND_SAMPLES / self.width));

@@ -12,8 +12,10 @@ typedef struct dem_placed {
     double origin[3];
 } dem_placed;
 
-/* As tl_mesh_verify_in, with the planes of triangles through these places; NULL: through the vertices. */
-tl_status dem_verify_placed(const tl_mesh *mesh, const dem_placed *placed, const tl_source *source, tl_frame frame,
-                            const tl_run *run, tl_mesh_report *out, tl_error *error);
+/* As tl_mesh_verify_in, with the planes of triangles through these places; NULL: through the vertices. `bounds` as in
+ * tl_mesh_verify_file. */
+tl_status dem_verify_placed(const tl_mesh *mesh, const dem_placed *placed, const tl_source *source,
+                            const tl_selection *bounds, tl_frame frame, const tl_run *run, tl_mesh_report *out,
+                            tl_error *error);
 
 #endif

@@ -402,6 +402,10 @@ typedef struct tl_mesh_report {
     int64_t worst_i, worst_j; /* where it is; -1 where no sample is covered */
     uint64_t samples;         /* valid samples that a triangle covers */
     uint64_t uncovered;       /* valid samples that no triangle covers */
+    /* Where bounds were given (see tl_mesh_verify_file): samples whose error is above their bound, and the largest
+     * excess, which is at worst_i, worst_j then. */
+    uint64_t exceeding;
+    double max_excess;
 } tl_mesh_report;
 
 /* Compares a mesh (of vertices on the source's finest grid) with every sample of the source, in double
@@ -902,9 +906,11 @@ TL_API tl_status tl_write_mesh(const tl_mesh *mesh, const char *path, const tl_w
 TL_API tl_rounding tl_write_rounding(const tl_source_info *grid, const char *path, tl_frame frame);
 /* Reads back the file that tl_write_mesh made of `mesh` in `frame`, and compares it with every sample of the source as
  * tl_mesh_verify_in does, but with the numbers that the file has. Triangles that are upright or look down, walls and
- * floors, count for nothing. TL_ERROR_DATA where the file is not such a mesh. */
-TL_API tl_status tl_mesh_verify_file(const char *path, const tl_mesh *mesh, const tl_source *source, tl_frame frame,
-                                     const tl_run *run, tl_mesh_report *out, tl_error *error);
+ * floors, count for nothing. `bounds`, unless NULL, holds the bound, or the map of bounds, that the samples are held to
+ * one by one; no more of it is used. TL_ERROR_DATA where the file is not such a mesh. */
+TL_API tl_status tl_mesh_verify_file(const char *path, const tl_mesh *mesh, const tl_source *source,
+                                     const tl_selection *bounds, tl_frame frame, const tl_run *run, tl_mesh_report *out,
+                                     tl_error *error);
 /* Writes an error pyramid to `path` as a GeoTIFF of bytes, or of floats where it is exact. */
 TL_API tl_status tl_pyramid_save(const tl_pyramid *pyramid, const char *path, const tl_write_options *options,
                                  tl_error *error);

@@ -74,7 +74,7 @@ static void filesAreAsFarFromTheDemAsTheirMeshes(void **state)
         tl_mesh_report own, read;
         tl_error error = {0};
         assert_int_equal(tl_mesh_verify(mesh, source, NULL, &own, NULL), TL_OK);
-        if (tl_mesh_verify_file(path, mesh, source, frame, NULL, &read, &error) != TL_OK)
+        if (tl_mesh_verify_file(path, mesh, source, NULL, frame, NULL, &read, &error) != TL_OK)
             fail_msg("%s", error.text);
         /* floats of a map's offsets below 256 round by 2^-17, over slopes below 70 in a cell of 2 */
         assert_true(fabs(read.max_error - own.max_error) <= (frame == TL_FRAME_PIXEL ? 0 : 2 * 70 * 0x1p-17));
@@ -107,12 +107,59 @@ static void filesTellWhatMemoryDoesNot(void **state)
     assert_int_equal(fwrite(&z, sizeof z, 1, file), 1);
     fclose(file);
     tl_mesh_report read;
-    assert_int_equal(tl_mesh_verify_file(path, mesh, source, TL_FRAME_PIXEL, NULL, &read, NULL), TL_OK);
+    assert_int_equal(tl_mesh_verify_file(path, mesh, source, NULL, TL_FRAME_PIXEL, NULL, &read, NULL), TL_OK);
     assert_true(read.max_error > 9000);
     tl_mesh_destroy(mesh);
     tl_source_destroy(source);
     assert_int_equal(unlink(path), 0);
     free(of.z);
+}
+
+/* Each sample is held to its own bound: those of a map, and the number where that is void. */
+static void samplesAreHeldToTheirOwnBounds(void **state)
+{
+    grid of, map;
+    (void)state;
+    random_state = 5;
+    tl_source *source = open_hills(&of, false);
+    const char *path = path_of("ply");
+    tl_mesh *mesh = write_mesh(source, 6, path, TL_FRAME_PIXEL);
+    size_t samples = (size_t)of.width * (size_t)of.height;
+    map = (grid){of.width, of.height, malloc(samples * sizeof(float))};
+    for (size_t k = 0; k < samples; k++)
+        map.z[k] = 6;
+    tl_source *limits = open_grid(&map);
+    tl_selection bounds = {.max_error = 6, .max_error_map = limits};
+    tl_mesh_report read;
+    assert_int_equal(tl_mesh_verify_file(path, mesh, source, &bounds, TL_FRAME_PIXEL, NULL, &read, NULL), TL_OK);
+    assert_int_equal(read.exceeding, 0);
+    assert_true(read.max_error > 3);
+    double worst = read.max_error;
+    int64_t i = read.worst_i, j = read.worst_j;
+    map.z[j * of.width + i] = 2;
+    assert_int_equal(tl_mesh_verify_file(path, mesh, source, &bounds, TL_FRAME_PIXEL, NULL, &read, NULL), TL_OK);
+    assert_int_equal(read.exceeding, 1);
+    assert_true(read.max_excess == worst - 2 && read.worst_i == i && read.worst_j == j);
+    map.z[j * of.width + i] = NAN;
+    assert_int_equal(tl_mesh_verify_file(path, mesh, source, &bounds, TL_FRAME_PIXEL, NULL, &read, NULL), TL_OK);
+    assert_int_equal(read.exceeding, 0);
+    bounds = (tl_selection){.max_error = 0};
+    assert_int_equal(tl_mesh_verify_file(path, mesh, source, &bounds, TL_FRAME_PIXEL, NULL, &read, NULL), TL_OK);
+    assert_true(read.exceeding > 100 && read.max_excess == worst);
+    tl_source_destroy(limits);
+    map.height--;
+    limits = open_grid(&map);
+    tl_error error;
+    bounds.max_error_map = limits;
+    assert_int_equal(tl_mesh_verify_file(path, mesh, source, &bounds, TL_FRAME_PIXEL, NULL, &read, &error),
+                     TL_ERROR_DATA);
+    assert_non_null(strstr(error.text, "give one for each"));
+    tl_source_destroy(limits);
+    tl_mesh_destroy(mesh);
+    tl_source_destroy(source);
+    assert_int_equal(unlink(path), 0);
+    free(of.z);
+    free(map.z);
 }
 
 static size_t load(const char *path, unsigned char **bytes)
@@ -179,6 +226,7 @@ int main(void)
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(filesAreAsFarFromTheDemAsTheirMeshes),
         cmocka_unit_test(filesTellWhatMemoryDoesNot),
+        cmocka_unit_test(samplesAreHeldToTheirOwnBounds),
         cmocka_unit_test(damagedFilesAreRefusedOrRead),
     };
     return cmocka_run_group_tests(tests, make_folder, remove_folder);

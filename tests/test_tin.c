@@ -443,7 +443,7 @@ static void check_ground(const ground *of, tl_mesh_kind kind, double max_error)
     /* and of the file, with its rounded numbers */
     tl_write_options writing = {.overwrite = true, .frame = TL_FRAME_ENU};
     assert_int_equal(tl_write_mesh(result.mesh, path, &writing, NULL), TL_OK);
-    assert_int_equal(tl_mesh_verify_file(path, result.mesh, source, TL_FRAME_ENU, NULL, &report, NULL), TL_OK);
+    assert_int_equal(tl_mesh_verify_file(path, result.mesh, source, NULL, TL_FRAME_ENU, NULL, &report, NULL), TL_OK);
     unlink(path);
     if (!(report.max_error <= max_error))
         fail_msg("%s, %g: the file is off by %.9g", of->crs, max_error, report.max_error);

@@ -159,8 +159,8 @@ static tl_status take_surface(checker *self, bool faces_up, tl_mesh *out, tl_err
 
 /* ---- The whole ------------------------------------------------------------------------------------------ */
 
-static tl_status measure(checker *self, bool faces_up, const tl_source *source, const tl_run *run, tl_mesh_report *out,
-                         tl_error *error)
+static tl_status measure(checker *self, bool faces_up, const tl_source *source, const tl_selection *bounds,
+                         const tl_run *run, tl_mesh_report *out, tl_error *error)
 {
     tl_mesh surface = {.vertex_count = self->file.vertex_count};
     surface.vertices = tl_alloc(self->file.vertex_count, sizeof *surface.vertices);
@@ -178,7 +178,7 @@ static tl_status measure(checker *self, bool faces_up, const tl_source *source, 
         status = take_surface(self, faces_up, &surface, error);
     dem_placed placed = {(const double(*)[3])self->at, {self->origin[0], self->origin[1], self->origin[2]}};
     if (status == TL_OK)
-        status = dem_verify_placed(&surface, &placed, source, self->kind, run, out, error);
+        status = dem_verify_placed(&surface, &placed, source, bounds, self->kind, run, out, error);
     free(surface.vertices);
     free(surface.indices);
     free(self->ideal);
@@ -188,8 +188,9 @@ static tl_status measure(checker *self, bool faces_up, const tl_source *source, 
     return status;
 }
 
-tl_status tl_mesh_verify_file(const char *path, const tl_mesh *mesh, const tl_source *source, tl_frame frame,
-                              const tl_run *run, tl_mesh_report *out, tl_error *error)
+tl_status tl_mesh_verify_file(const char *path, const tl_mesh *mesh, const tl_source *source,
+                              const tl_selection *bounds, tl_frame frame, const tl_run *run, tl_mesh_report *out,
+                              tl_error *error)
 {
     checker self = {.path = path, .mesh = mesh};
     out_frame *made = out_frame_create(mesh, frame, path, error);
@@ -203,7 +204,7 @@ tl_status tl_mesh_verify_file(const char *path, const tl_mesh *mesh, const tl_so
     out_frame_destroy(made);
     tl_status status = out_mesh_read(path, &self.file, error);
     if (status == TL_OK)
-        status = measure(&self, faces_up, source, run, out, error);
+        status = measure(&self, faces_up, source, bounds, run, out, error);
     out_mesh_free(&self.file);
     return status;
 }
