@@ -17,7 +17,11 @@
 
 #include <string.h>
 
-enum { TL_BLOCK_LOG = 8, TL_BLOCK = 1 << TL_BLOCK_LOG };
+/* Blocks that are decided alone: 2^8 samples on a side stay in a core's cache. At least 2^6, the bits of a word. */
+#ifndef TL_FRAMEWORK_BLOCK_LOG
+#define TL_FRAMEWORK_BLOCK_LOG 8
+#endif
+enum { TL_BLOCK_LOG = TL_FRAMEWORK_BLOCK_LOG, TL_BLOCK = 1 << TL_BLOCK_LOG };
 
 /* A triangle that ties in a sample which no cell draws: see framework_ties.c. */
 typedef struct tl_tie {
