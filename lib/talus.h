@@ -697,6 +697,21 @@ typedef struct tl_view {
     double refraction;
 } tl_view;
 
+/* A view on a path. */
+typedef struct tl_view_key {
+    double time; /* seconds; NaN: the file does not say */
+    tl_view view;
+} tl_view_key;
+
+/* Reads views from a camera file: the members of tl_view by their names in a JSON, as {"eye": [11.3, 46.7, 300],
+ * "above_ground": true, "heading": 120}; several of them, with "time", as {"views": [...]}, where members beside "views"
+ * count for each view that does not say otherwise; or the cameras of a glTF (.gltf, .glb) with the origin that talus
+ * writes into the asset's extras: perspective ones, placed by nodes. *keys is freed by free().
+ * TL_ERROR_DATA where the file holds no views, or members that are not known. */
+TL_API tl_status tl_view_path_read(const char *path, tl_view_key **keys, size_t *count, tl_error *error);
+/* The same for a file of one view. */
+TL_API tl_status tl_view_read(const char *path, tl_view *out, tl_error *error);
+
 /* Ways to choose the triangles. */
 typedef enum tl_selector {
     TL_SELECTOR_QUADTREE = 0, /* breadth first, with two queues */
