@@ -763,6 +763,28 @@ typedef struct tl_lod_stats {
 TL_API tl_status tl_select(const tl_source *field, const tl_source *dem, const tl_pyramid *pyramid, const tl_view *view,
                            const tl_lod_options *options, tl_mesh **out, tl_lod_stats *stats, tl_error *error);
 
+/* How tl_view_write_picture draws. */
+typedef struct tl_view_picture_options {
+    double sun_azimuth, sun_elevation; /* degrees, clockwise from north and above the horizon (0 ... 90), at the eye's
+                                          foot; both 0: 315 and 45 */
+    double haze;         /* metres at which half of the light is lost in the air; 0: clear */
+    double exaggeration; /* factor on the mesh's heights, not on the eye's, 0 ... 1e6; 0: 1 */
+    bool grey;           /* no colours by height */
+    bool facets;         /* light each triangle by itself; else by normals at its corners, means over the triangles
+                            around weighted by their areas, so that no triangle shows */
+    const char *depth;   /* also write an EXR of this name: metres ahead of the eye (along the middle of the picture) at
+                            the middle of each pixel, float32, void where nothing is seen; of the first view. NULL: none */
+    bool overwrite;
+    const tl_run *run;
+} tl_view_picture_options;
+
+/* Draws a mesh that tl_select made over `dem` (or any mesh over a lattice with dem's place) as a PNG, with four samples
+ * a pixel. Faces are seen from above only, and where there are none there is sky. The colours of heights are those of
+ * the whole of `dem`, a sample of which is read. Of several views of the same size the picture is the mean of the light
+ * that they get: motion blur. Equal for any number of threads. */
+TL_API tl_status tl_view_write_picture(const tl_mesh *mesh, const tl_source *dem, const tl_view *views, size_t count,
+                                       const char *path, const tl_view_picture_options *options, tl_error *error);
+
 /* ---- Statistics -------------------------------------------------------------------------------- */
 
 /* How like fractional Brownian motion a raster is: E|Z(x + h) - Z(x)|^2 = delta^2 |h|^(2 hurst), with h in samples (of

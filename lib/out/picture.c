@@ -42,7 +42,7 @@ static tl_status check(const tl_source *beside, const char *path, const tl_previ
     return check_view(path, o, error);
 }
 
-static tl_status write_picture(const scene_picture *picture, tl_output *output, const tl_run *run, tl_error *error)
+tl_status out_picture_write(const scene_picture *picture, tl_output *output, const tl_run *run, tl_error *error)
 {
     enum { BAND = 64 };
     out_png encoder = {0};
@@ -74,7 +74,7 @@ static tl_status draw(const tl_source *source, const tl_source *beside, const tl
     tl_status status = options->perspective ? scene_perspective(source, options, &picture, error)
                                             : scene_hillshade(source, beside, options, &picture, error);
     if (status == TL_OK)
-        status = write_picture(&picture, output, options->run, error);
+        status = out_picture_write(&picture, output, options->run, error);
     scene_picture_finish(&picture);
     return status;
 }

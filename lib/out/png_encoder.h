@@ -3,6 +3,7 @@
 #define OUT_PNG_ENCODER_H
 
 #include "lib/base/output.h"
+#include "lib/scene/render.h"
 #include "lib/talus.h"
 
 typedef enum out_png_kind { OUT_PNG_GREY16 = 0, OUT_PNG_RGBA8 } out_png_kind;
@@ -22,5 +23,8 @@ tl_status out_png_begin(out_png *self, tl_output *output, out_png_kind kind, int
 tl_status out_png_rows(out_png *self, const unsigned char *rows, int64_t count);
 tl_status out_png_end(out_png *self);
 void out_png_finish(out_png *self);
+
+/* A whole picture. */
+tl_status out_picture_write(const scene_picture *picture, tl_output *output, const tl_run *run, tl_error *error);
 
 #endif

@@ -161,7 +161,11 @@ scene_rgb scene_lit(const scene_light *light, scene_rgb colour, float east, floa
     east = east > wall ? wall : east < -wall ? -wall : east;
     north = north > wall ? wall : north < -wall ? -wall : north;
     float length = 1 / sqrtf(east * east + north * north + 1);
-    const float normal[3] = {-east * length, -north * length, length};
+    return scene_lit_normal(light, colour, (const float[3]){-east * length, -north * length, length}, shadow);
+}
+
+scene_rgb scene_lit_normal(const scene_light *light, scene_rgb colour, const float normal[3], float shadow)
+{
     float sun = 0.98f * facing(light->sun, normal) * shadow;
     float fill = 0.14f * facing(light->fill, normal);
     float sky = 0.26f * (0.5f + 0.5f * normal[2]);

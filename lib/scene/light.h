@@ -34,6 +34,8 @@ void scene_light_init(scene_light *light, double azimuth, double elevation);
 /* The light that a surface sends to the eye: `east` and `north` are its slopes (metres up a metre), `shadow` is 0 where
  * the sun is hidden, 1 where it shines. */
 scene_rgb scene_lit(const scene_light *light, scene_rgb colour, float east, float north, float shadow);
+/* The same by its normal, of length 1. */
+scene_rgb scene_lit_normal(const scene_light *light, scene_rgb colour, const float normal[3], float shadow);
 
 /* A byte of sRGB, for a linear value; what is below 0 or above 1 is cut. */
 unsigned char scene_encode(float linear);
