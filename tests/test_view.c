@@ -221,12 +221,266 @@ static void refractionIsALargerEarth(void **state)
     tl_crs_release(crs);
 }
 
+/* ---- Rules ------------------------------------------------------------------------------------------- */
+
+static tl_view some_view(const ground *of)
+{
+    tl_view v = {.eye = {of->eye[0], of->eye[1], of->eye[2]}, .width = 1920, .height = 1080};
+    if (draw() < 0.2)
+        v.eye[2] = pow(10, between(0, 9));
+    v.heading = between(-180, 180);
+    v.pitch = draw() < 0.2 ? -90 : between(-60, 40);
+    v.roll = draw() < 0.5 ? 0 : between(-180, 180);
+    v.fov = draw() < 0.2 ? 0.01 : draw() < 0.2 ? 179 : between(10, 120);
+    return v;
+}
+
+static bool is_on_screen(const scene_camera *c, const double xyz[3])
+{
+    double v[3];
+    scene_camera_view(c, xyz, v);
+    return v[2] > 0 && fabs(v[0]) <= c->width / 2 * v[2] && fabs(v[1]) <= c->height / 2 * v[2];
+}
+
+/* Whether the way from the eye to a point goes through the ellipsoid, lowered by 11.5 km: no ground is below it. */
+static bool goes_through_earth(const tl_georef *g, const double origin[2], const double eye[3], const double xyz[3])
+{
+    dem_local_frame *at = dem_local_frame_create(g->crs, origin[0], origin[1], 0, NULL);
+    /* the frame at the equator, under the origin's meridian, gives the Earth's own axes */
+    double centre[3], north[3], axis[3] = {0}, a = 6378137 - 11500, b = 6356752.3 - 11500;
+    dem_local_frame_forward(at, origin[0], 90, 0, north);
+    dem_local_frame_forward(at, origin[0], -90, 0, centre);
+    for (int k = 0; k < 3; k++) {
+        axis[k] = (north[k] - centre[k]) / (2 * 6356752.314);
+        centre[k] = (north[k] + centre[k]) / 2;
+    }
+    bool through = false;
+    for (int step = 0; step <= 4000 && !through; step++) {
+        double p[3], along = 0, all = 0, t = step / 4000.0;
+        for (int k = 0; k < 3; k++) {
+            p[k] = eye[k] + t * (xyz[k] - eye[k]) - centre[k];
+            along += p[k] * axis[k];
+            all += p[k] * p[k];
+        }
+        through = (all - along * along) / (a * a) + along * along / (b * b) < 1;
+    }
+    dem_local_frame_destroy(at);
+    return through;
+}
+
+/* Some direction within the cone of slopes around the way up at a place. */
+static void some_normal(const scene_view *view, double i, double j, double slope, double out[3])
+{
+    double low[3], high[3], up[3], side[3], n[3];
+    place(view, i, j, 0, low);
+    place(view, i, j, 1000, high);
+    for (int a = 0; a < 3; a++)
+        up[a] = (high[a] - low[a]) / 1000;
+    for (int a = 0; a < 3; a++)
+        side[a] = between(-1, 1);
+    n[0] = up[1] * side[2] - up[2] * side[1];
+    n[1] = up[2] * side[0] - up[0] * side[2];
+    n[2] = up[0] * side[1] - up[1] * side[0];
+    double steep = slope * (draw() < 0.5 ? 1 : draw()) / length(n);
+    for (int a = 0; a < 3; a++)
+        out[a] = up[a] + steep * n[a];
+}
+
+static void rulesHideNothingThatIsToBeSeen(void **state)
+{
+    (void)state;
+    int hidden[3] = {0}, tried = 0;
+    for (int g = 0; g < GROUNDS; g++) {
+        const ground *of = &grounds[g];
+        float *heights;
+        tl_source *dem = open_ground(of, &heights);
+        draw_state = 3;
+        for (int n = 0; n < 150; n++) {
+            tl_view v = some_view(of);
+            scene_view *view = open_view(&v, dem);
+            const double *eye = scene_view_camera(view)->eye;
+            for (int m = 0; m < 10; m++, tried++) {
+                scene_extent e = some_extent(of);
+                scene_box box;
+                scene_view_box(view, &e, &box);
+                double slope = pow(10, between(-3, 1));
+                unsigned rules[3];
+                for (int r = 0; r < 3; r++)
+                    hidden[r] += (rules[r] = scene_view_hides(view, &e, &box, slope, 1u << r)) != 0;
+                assert_int_equal(scene_view_hides(view, &e, &box, slope, 0), 0);
+                for (int k = 0; k < 4; k++) {
+                    double i = between(e.i0, e.i1), j = between(e.j0, e.j1), xyz[3], normal[3], facing = 0;
+                    place(view, i, j, between(e.low, e.high), xyz);
+                    if (rules[0])
+                        assert_false(is_on_screen(scene_view_camera(view), xyz));
+                    some_normal(view, i, j, slope, normal);
+                    for (int a = 0; a < 3; a++)
+                        facing += normal[a] * (eye[a] - xyz[a]);
+                    if (rules[1])
+                        assert_true(facing < 0);
+                    if (rules[2] && k == 0)
+                        assert_true(goes_through_earth(&dem->info.georef, of->eye, eye, xyz));
+                }
+            }
+            scene_view_destroy(view);
+        }
+        close_ground(dem, heights);
+    }
+    /* they do hide: of boxes of all sizes anywhere, the frustum more than half */
+    assert_true(2 * hidden[0] > tried && 50 * hidden[1] > tried && 50 * hidden[2] > tried);
+}
+
+/* ---- Ridges ------------------------------------------------------------------------------------------ */
+
+enum { SIDE = 257, SQUARE = 4, SQUARES = (SIDE - 1) / SQUARE };
+
+/* Bilinear between samples. */
+static double surface(const float *heights, double i, double j)
+{
+    int x = (int)fmin(floor(i), SIDE - 2), y = (int)fmin(floor(j), SIDE - 2);
+    double u = i - x, v = j - y;
+    const float *h = heights + y * SIDE + x;
+    return (1 - v) * ((1 - u) * (double)h[0] + u * (double)h[1]) +
+           v * ((1 - u) * (double)h[SIDE] + u * (double)h[SIDE + 1]);
+}
+
+typedef struct square {
+    scene_extent extent;
+    scene_box box;
+    double distance;
+} square;
+
+static int by_distance(const void *a, const void *b)
+{
+    double x = ((const square *)a)->distance, y = ((const square *)b)->distance;
+    return (x > y) - (x < y);
+}
+
+static scene_extent square_extent(const float *heights, int column, int row)
+{
+    scene_extent e = {column * SQUARE, row * SQUARE, (column + 1) * SQUARE, (row + 1) * SQUARE, 1e9, -1e9};
+    for (int y = 0; y <= SQUARE; y++)
+        for (int x = 0; x <= SQUARE; x++) {
+            double z = (double)heights[(row * SQUARE + y) * SIDE + column * SQUARE + x];
+            e.low = fmin(e.low, z);
+            e.high = fmax(e.high, z);
+        }
+    return e;
+}
+
+/* Whether the way from the eye to a point of the lattice is in the ground somewhere. */
+static bool is_in_ground(const float *heights, const double from[3], const double to[3])
+{
+    double length_in_cells = hypot(to[0] - from[0], to[1] - from[1]);
+    int steps = (int)(length_in_cells * 8) + 1;
+    for (int k = 0; k < steps; k++) {
+        double t = (double)k / steps;
+        double i = from[0] + t * (to[0] - from[0]), j = from[1] + t * (to[1] - from[1]);
+        if (from[2] + t * (to[2] - from[2]) < surface(heights, i, j))
+            return true;
+    }
+    return false;
+}
+
+static void ridgesHideOnlyWhatIsBehindThem(void **state)
+{
+    (void)state;
+    static float heights[SIDE * SIDE];
+    static square squares[SQUARES * SQUARES];
+    const ground of = {SIDE, SIDE, NULL, 0, 0, 30, 30, 500, {0}};
+    for (int k = 0; k < SIDE * SIDE; k++)
+        heights[k] = (float)height_at(&of, k % SIDE, k / SIDE);
+    tl_source_info info = {.width = SIDE, .height = SIDE, .type = TL_RASTER_POINT, .name = "hills"};
+    info.georef = (tl_georef){NULL, false, {0, 1, 0, 0, 0, -1}, 30, 30, 1};
+    tl_source *dem = tl_array_source_create(heights, &info, NULL);
+    int hidden = 0, visible = 0;
+    for (int n = 0; n < 6; n++) {
+        const double from[2] = {60.3 + 30 * n, 200.7 - 25 * n};
+        tl_view v = {.eye = {from[0], -from[1], 60}, .above_ground = true, .heading = 72 * n, .fov = n < 4 ? 70 : 15};
+        v.pitch = n == 5 ? -60 : -4;
+        scene_view *view = open_view(&v, dem);
+        const double eye[3] = {from[0], from[1], scene_view_camera(view)->eye[2]};
+        scene_skyline *skyline = scene_skyline_create(view, NULL);
+        for (int k = 0; k < SQUARES * SQUARES; k++) {
+            square *s = &squares[k];
+            s->extent = square_extent(heights, k % SQUARES, k / SQUARES);
+            scene_view_box(view, &s->extent, &s->box);
+            s->distance = scene_view_distance(view, &s->box);
+        }
+        qsort(squares, SQUARES * SQUARES, sizeof *squares, by_distance);
+        for (int k = 0; k < SQUARES * SQUARES; k++) {
+            const square *s = &squares[k];
+            bool hides = scene_skyline_hides(skyline, view, &s->extent, &s->box);
+            scene_skyline_raise(skyline, view, &s->extent);
+            hidden += hides;
+            visible += !hides && !scene_view_hides(view, &s->extent, &s->box, HUGE_VAL, SCENE_HIDDEN_FRUSTUM);
+            for (int p = 0; p < 40 && hides; p++) {
+                double i = between(s->extent.i0, s->extent.i1), j = between(s->extent.j0, s->extent.j1), xyz[3];
+                double z = surface(heights, i, j);
+                place(view, i, j, z, xyz);
+                if (is_on_screen(scene_view_camera(view), xyz))
+                    assert_true(is_in_ground(heights, eye, (const double[3]){i, j, z - 1e-3}));
+            }
+        }
+        scene_skyline_destroy(skyline);
+        scene_view_destroy(view);
+    }
+    tl_source_destroy(dem);
+    assert_true(hidden > visible / 2);
+}
+
+/* A void lets lines of sight below the ground behind it. */
+static void holesLeakIntoTheSkyline(void **state)
+{
+    (void)state;
+    static float heights[SIDE * SIDE];
+    tl_source_info info = {.width = SIDE, .height = SIDE, .type = TL_RASTER_POINT, .name = "hills"};
+    info.georef = (tl_georef){NULL, false, {0, 1, 0, 0, 0, -1}, 30, 30, 1};
+    tl_source *dem = tl_array_source_create(heights, &info, NULL);
+    tl_view v = {.eye = {10.5, -128, 50}};
+    v.heading = 90;
+    scene_view *view = open_view(&v, dem);
+    const scene_extent hole = {50, 100, 60, 150, 0, 10}, near = {30, 118, 40, 138, 200, 300},
+                       wall = {100, 80, 110, 180, 900, 1000}, behind = {200, 120, 210, 130, 0, 100};
+    scene_box box, hole_box;
+    scene_view_box(view, &behind, &box);
+    scene_view_box(view, &hole, &hole_box);
+    {
+        scene_skyline *skyline = scene_skyline_create(view, NULL);
+        assert_false(scene_skyline_hides(skyline, view, &behind, &box));
+        scene_skyline_raise(skyline, view, &wall);
+        assert_true(scene_skyline_hides(skyline, view, &behind, &box));
+        scene_skyline_leak(skyline, &hole_box);
+        assert_false(scene_skyline_hides(skyline, view, &behind, &box));
+        scene_skyline_raise(skyline, view, &wall);
+        assert_false(scene_skyline_hides(skyline, view, &behind, &box));
+        scene_skyline_raise(skyline, view, &near);
+        assert_true(scene_skyline_hides(skyline, view, &behind, &box));
+        scene_skyline_destroy(skyline);
+    }
+    /* an eye under the ground, and a raster with holes nobody tells of: nothing is hidden */
+    scene_view_know_ground(view, 0, true);
+    scene_skyline *skyline = scene_skyline_create(view, NULL);
+    scene_skyline_raise(skyline, view, &wall);
+    assert_false(scene_skyline_hides(skyline, view, &behind, &box));
+    scene_skyline_destroy(skyline);
+    scene_view_destroy(view);
+    v.eye[2] = -1;
+    view = open_view(&v, dem);
+    skyline = scene_skyline_create(view, NULL);
+    scene_skyline_raise(skyline, view, &wall);
+    assert_false(scene_skyline_hides(skyline, view, &behind, &box));
+    scene_skyline_destroy(skyline);
+    scene_view_destroy(view);
+    tl_source_destroy(dem);
+}
+
 int main(void)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(placesAreThoseOfTheEllipsoid),
-        cmocka_unit_test(boxesHoldAllThatIsInTheirExtents),
-        cmocka_unit_test(refractionIsALargerEarth),
+        cmocka_unit_test(placesAreThoseOfTheEllipsoid),   cmocka_unit_test(boxesHoldAllThatIsInTheirExtents),
+        cmocka_unit_test(refractionIsALargerEarth),       cmocka_unit_test(rulesHideNothingThatIsToBeSeen),
+        cmocka_unit_test(ridgesHideOnlyWhatIsBehindThem), cmocka_unit_test(holesLeakIntoTheSkyline),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }

@@ -10,7 +10,7 @@
 #include <pthread.h>
 #include <stdlib.h>
 
-enum { BATCH = 256, PARTS = 6, BUDGET = 1 << 18, NEAR = 0, WHOLE = 1 };
+enum { BATCH = 256, PARTS = 6, BUDGET = 1 << 17, NEAR = 0, WHOLE = 1 };
 
 static const double near_side = 1e6;   /* metres: of the finer grid around the eye */
 static const double finest = 1e-4;     /* metres: tolerance near the eye */

@@ -25,6 +25,7 @@ typedef struct wall {
 } wall;
 
 typedef struct bucket {
+    double limit; /* walls farther than this do not count */
     int count;
     wall walls[KEPT];
 } bucket;
@@ -97,6 +98,8 @@ scene_skyline *scene_skyline_create(const scene_view *view, tl_error *error)
         tl_fail_memory(error, "the view");
         return NULL;
     }
+    for (int k = 0; k < BUCKETS; k++)
+        s->buckets[k].limit = (double)INFINITY;
     s->sees = is_above_ground(view);
     s->eye = view->camera.eye[2];
     s->margin = 0.01 / view->camera.focal;
@@ -113,6 +116,8 @@ void scene_skyline_destroy(scene_skyline *skyline)
 
 static void add_wall(bucket *b, wall w)
 {
+    if (w.distance > b->limit)
+        return;
     if (b->count && b->walls[b->count - 1].rise >= w.rise)
         return; /* a nearer one hides as much, or is fed too late to be worth sorting */
     while (b->count && b->walls[b->count - 1].distance >= w.distance)
@@ -123,6 +128,12 @@ static void add_wall(bucket *b, wall w)
         b->count--;
     }
     b->walls[b->count++] = w;
+}
+
+/* Level metres to the line from a to b at a rim of a bucket; between two rims it is nowhere farther than at one. */
+static double wall_distance(const scene_skyline *s, const double a[3], const double b[3], double area, int rim)
+{
+    return area / (s->sine[rim] * (b[1] - a[1]) - s->cosine[rim] * (b[0] - a[0]));
 }
 
 /* A wall from a to b, places relative to the eye. */
@@ -140,11 +151,13 @@ static void raise(scene_skyline *s, const double a[3], const double b[3])
     /* the plane through the eye and the wall's top: up = p east + q north */
     double p = (a[2] * b[1] - b[2] * a[1]) / area, q = (a[0] * b[2] - b[0] * a[2]) / area;
     /* within a bucket a sine is not lower than at the rims by more than this */
-    double sag = hypot(p, q) * s->width * s->width / 8, distance = fmax(hypot(a[0], a[1]), hypot(b[0], b[1]));
-    double before = p * s->sine[(int)first] + q * s->cosine[(int)first];
+    double sag = hypot(p, q) * s->width * s->width / 8;
+    double before = p * s->sine[(int)first] + q * s->cosine[(int)first],
+           until = wall_distance(s, a, b, area, (int)first);
     for (int k = (int)first; k < (int)end; k++) {
-        double after = p * s->sine[k + 1] + q * s->cosine[k + 1];
-        add_wall(&s->buckets[k], (wall){distance, fmin(before, after) - sag});
+        double after = p * s->sine[k + 1] + q * s->cosine[k + 1], near = until;
+        until = wall_distance(s, a, b, area, k + 1);
+        add_wall(&s->buckets[k], (wall){fmax(near, until), fmin(before, after) - sag});
         before = after;
     }
 }
@@ -192,21 +205,25 @@ void scene_skyline_raise(scene_skyline *skyline, const scene_view *view, const s
 
 /* ---- hiding ---- */
 
-/* Whether every bucket on the way from azimuth `from` to `to` hides what rises `rise` at `distance`; counts them. */
-static bool all_hide(const scene_skyline *s, double from, double to, double distance, double rise, int *seen)
+/* The buckets on the way from azimuth `from` to `to`. False: there are none. */
+static bool buckets_of(const scene_skyline *s, double from, double to, int *first, int *last)
 {
-    double first = fmax(floor((from - s->first) / s->width - 1e-6), 0),
-           last = fmin(floor((to - s->first) / s->width + 1e-6), BUCKETS - 1);
-    for (double k = first; k <= last; k++) {
-        const bucket *b = &s->buckets[(int)k];
-        int w = b->count;
-        while (w > 0 && b->walls[w - 1].distance > distance)
-            w--;
-        if (w == 0 || !(b->walls[w - 1].rise > rise))
-            return false;
-        ++*seen;
-    }
+    double low = fmax(floor((from - s->first) / s->width - 1e-6), 0),
+           high = fmin(floor((to - s->first) / s->width + 1e-6), BUCKETS - 1);
+    if (!(low <= high))
+        return false;
+    *first = (int)low;
+    *last = (int)high;
     return true;
+}
+
+/* Whether a bucket hides what rises `rise` at `distance`. */
+static bool bucket_hides(const bucket *b, double distance, double rise)
+{
+    int w = b->count;
+    while (w > 0 && b->walls[w - 1].distance > distance)
+        w--;
+    return w > 0 && b->walls[w - 1].rise > rise;
 }
 
 /* The azimuths of a rectangle beside the eye, from straight ahead. */
@@ -224,13 +241,18 @@ static void azimuths(const scene_skyline *s, const scene_box *box, double *from,
     }
 }
 
+/* Level metres from the eye's vertical to the nearest point of a box. */
+static double level_distance(const scene_box *box)
+{
+    return hypot(fmax(fmax(box->low[0], -box->high[0]), 0), fmax(fmax(box->low[1], -box->high[1]), 0));
+}
+
 bool scene_skyline_hides(const scene_skyline *s, const scene_view *view, const scene_extent *extent,
                          const scene_box *box)
 {
     (void)view;
     (void)extent;
-    double east = fmax(fmax(box->low[0], -box->high[0]), 0), north = fmax(fmax(box->low[1], -box->high[1]), 0);
-    double nearest = hypot(east, north);
+    double nearest = level_distance(box);
     if (!s->sees || !(nearest > 0))
         return false;
     double up = box->high[2] - s->eye, rise = up / nearest, from, to;
@@ -239,8 +261,31 @@ bool scene_skyline_hides(const scene_skyline *s, const scene_view *view, const s
     rise += s->margin * (1 + rise * rise);
     azimuths(s, box, &from, &to);
     int seen = 0;
-    for (int turn = -1; turn <= 1; turn++)
-        if (!all_hide(s, from + turn * 2 * pi, to + turn * 2 * pi, nearest, rise, &seen))
-            return false;
+    for (int turn = -1; turn <= 1; turn++) {
+        int first, last;
+        if (!buckets_of(s, from + turn * 2 * pi, to + turn * 2 * pi, &first, &last))
+            continue;
+        for (int k = first; k <= last; k++, seen++)
+            if (!bucket_hides(&s->buckets[k], nearest, rise))
+                return false;
+    }
     return seen > 0;
+}
+
+void scene_skyline_leak(scene_skyline *s, const scene_box *box)
+{
+    double nearest = level_distance(box), from = -pi, to = pi;
+    if (nearest > 0)
+        azimuths(s, box, &from, &to);
+    for (int turn = -1; turn <= 1; turn++) {
+        int first, last;
+        if (!buckets_of(s, from + turn * 2 * pi, to + turn * 2 * pi, &first, &last))
+            continue;
+        for (int k = first; k <= last; k++) {
+            bucket *b = &s->buckets[k];
+            b->limit = fmin(b->limit, nearest);
+            while (b->count && b->walls[b->count - 1].distance > b->limit)
+                b->count--;
+        }
+    }
 }
