@@ -1,0 +1,195 @@
+/* Breadth first, with two queues: all triangles of one size are looked at together, so that what they need is made
+ * together, and then those that they are split into. */
+#include "lib/base/error.h"
+#include "lib/base/size.h"
+#include "lib/scene/lod.h"
+
+#include <math.h>
+
+enum { TESTED = 512 };
+
+typedef struct search {
+    lod *l;
+    lod_list current, next; /* lod_triangle */
+    lod_list verdicts;      /* lod_verdict, of the current ones */
+    lod_list *leaves;
+    int depth;
+} search;
+
+static tl_status test_item(void *context, tl_parallel *loop, uint64_t item, unsigned worker, tl_error *error)
+{
+    (void)loop;
+    (void)worker;
+    (void)error;
+    search *self = context;
+    size_t end = (size_t)(item + 1) * TESTED;
+    end = end < self->current.count ? end : self->current.count;
+    const lod_triangle *triangles = self->current.items;
+    for (size_t k = (size_t)item * TESTED; k < end; k++)
+        ((lod_verdict *)self->verdicts.items)[k] = lod_test(self->l, &triangles[k], self->depth, self->l->rules);
+    return TL_OK;
+}
+
+tl_status lod_find_blocks(lod *l, lod_triangle *triangles, size_t count, tl_error *error)
+{
+    tl_status status = TL_OK;
+    for (size_t k = 0; k < count && status == TL_OK; k++) {
+        lod_triangle *t = &triangles[k];
+        int64_t i = tl_int64_min(tl_int64_min(lod_at(l, t->a)->x, lod_at(l, t->b)->x), lod_at(l, t->apex)->x) / l->cell;
+        int64_t j = tl_int64_min(tl_int64_min(lod_at(l, t->a)->y, lod_at(l, t->b)->y), lod_at(l, t->apex)->y) / l->cell;
+        if (i < l->dem->info.width && j < l->dem->info.height)
+            status = scene_tiles_want_block(l->tiles, i, j, &t->block, error);
+    }
+    return status == TL_OK ? scene_tiles_make(l->tiles, l->run, error) : status;
+}
+
+static tl_status test_all(search *self, tl_error *error)
+{
+    lod *l = self->l;
+    self->verdicts.count = 0;
+    if (!lod_list_grow(&self->verdicts, self->current.count, sizeof(lod_verdict)))
+        return tl_fail_memory(error, "the view's triangles");
+    tl_run quiet = l->run ? *l->run : (tl_run){0};
+    quiet.progress = NULL;
+    if (self->current.count <= 4 * TESTED)
+        quiet.threads = 1;
+    return tl_parallel_for(&quiet, (self->current.count + TESTED - 1) / TESTED, 0, test_item, self, error);
+}
+
+static int rule_index(unsigned rule)
+{
+    return __builtin_ctz(rule);
+}
+
+/* A cell with one void corner, at the end of its diagonal, is drawn with the other diagonal: by this triangle and the
+ * one on the other side, whose right angle must be there. */
+static tl_status ask_opposite(lod *l, const lod_triangle *t, tl_error *error)
+{
+    const lod_vertex *a = lod_at(l, t->a), *b = lod_at(l, t->b), *apex = lod_at(l, t->apex);
+    if (isnan(a->z) == isnan(b->z) || isnan(apex->z))
+        return TL_OK;
+    return lod_ask(l, a->x + b->x - apex->x, a->y + b->y - apex->y, error);
+}
+
+tl_status lod_leave(lod *l, const lod_triangle *t, int depth, lod_list *leaves, tl_error *error)
+{
+    if (!lod_list_grow(leaves, 1, sizeof(lod_leaf)))
+        return tl_fail_memory(error, "the view's triangles");
+    ((lod_leaf *)leaves->items)[leaves->count++] = (lod_leaf){*t, depth};
+    return ask_opposite(l, t, error);
+}
+
+/* Sorts the tested triangles into leaves, and those whose middles are asked for, which stay in `current`. */
+static tl_status sort_out(search *self, tl_error *error)
+{
+    lod *l = self->l;
+    lod_triangle *triangles = self->current.items;
+    size_t kept = 0;
+    tl_status status = TL_OK;
+    l->stats.visited += self->current.count;
+    l->asked.count = 0;
+    for (size_t k = 0; k < self->current.count && status == TL_OK; k++) {
+        const lod_verdict *v = (const lod_verdict *)self->verdicts.items + k;
+        if (v->state == LOD_HIDDEN)
+            l->stats.culled[rule_index(v->rule)]++;
+        else if (v->state == LOD_LEAF) {
+            l->stats.pixel_error = fmax(l->stats.pixel_error, (double)v->pixels);
+            status = lod_leave(l, &triangles[k], self->depth, self->leaves, error);
+        } else if (v->state == LOD_SPLIT) {
+            triangles[kept] = triangles[k];
+            triangles[kept++].step = v->step;
+        }
+    }
+    self->current.count = kept;
+    return status;
+}
+
+/* Asks for the middles, and queues the halves. */
+static tl_status split_all(search *self, tl_error *error)
+{
+    lod *l = self->l;
+    const lod_triangle *triangles = self->current.items;
+    size_t before = l->asked.count; /* opposite corners */
+    tl_status status = TL_OK;
+    for (size_t k = 0; k < self->current.count && status == TL_OK; k++) {
+        int32_t x, y;
+        lod_middle(l, &triangles[k], &x, &y);
+        status = lod_ask(l, x, y, error);
+    }
+    if (status == TL_OK)
+        status = lod_mark_asked(l, error);
+    self->next.count = 0;
+    if (status == TL_OK && !lod_list_grow(&self->next, 2 * self->current.count, sizeof(lod_triangle)))
+        return tl_fail_memory(error, "the view's triangles");
+    for (size_t k = 0; k < self->current.count && status == TL_OK; k++) {
+        const lod_triangle *t = &triangles[k];
+        uint32_t middle = lod_asked(l, before + k)->vertex;
+        if (middle == LOD_NONE) {
+            status = lod_leave(l, t, self->depth, self->leaves, error);
+            continue;
+        }
+        lod_triangle *to = (lod_triangle *)self->next.items + self->next.count;
+        to[0] = (lod_triangle){t->apex, t->a, middle, t->block, t->step};
+        to[1] = (lod_triangle){t->b, t->apex, middle, t->block, t->step};
+        self->next.count += 2;
+        l->stats.split++;
+    }
+    return status;
+}
+
+/* Looks for the blocks of what is not hidden. */
+static tl_status enter_blocks(search *self, tl_error *error)
+{
+    lod *l = self->l;
+    tl_status status = test_all(self, error);
+    lod_triangle *triangles = self->current.items;
+    size_t kept = 0;
+    for (size_t k = 0; k < self->current.count && status == TL_OK; k++) {
+        const lod_verdict *v = (const lod_verdict *)self->verdicts.items + k;
+        if (v->state == LOD_HIDDEN)
+            l->stats.culled[rule_index(v->rule)]++;
+        else if (v->state != LOD_DROPPED)
+            triangles[kept++] = triangles[k];
+    }
+    self->current.count = kept;
+    return status == TL_OK ? lod_find_blocks(l, triangles, kept, error) : status;
+}
+
+static tl_status one_depth(search *self, tl_error *error)
+{
+    lod *l = self->l;
+    tl_status status = tl_run_check(l->run, error);
+    if (status == TL_OK && self->depth == lod_block_depth(l))
+        status = enter_blocks(self, error);
+    if (status == TL_OK)
+        status = test_all(self, error);
+    if (status == TL_OK)
+        status = sort_out(self, error);
+    if (status == TL_OK)
+        status = split_all(self, error);
+    return status;
+}
+
+tl_status lod_quadtree(lod *l, uint64_t limit, lod_list *leaves, tl_error *error)
+{
+    search self = {.l = l, .leaves = leaves};
+    tl_status status =
+        lod_list_grow(&self.current, 2, sizeof(lod_triangle)) ? TL_OK : tl_fail_memory(error, "the view");
+    if (status == TL_OK) {
+        lod_roots(l, self.current.items);
+        self.current.count = 2;
+    }
+    for (; status == TL_OK && self.current.count; self.depth++) {
+        status = one_depth(&self, error);
+        lod_list done = self.current;
+        self.current = self.next;
+        self.next = done;
+        l->overflow = limit && leaves->count > limit;
+        if (l->overflow)
+            break;
+    }
+    free(self.current.items);
+    free(self.next.items);
+    free(self.verdicts.items);
+    return status == TL_OK && !l->overflow ? lod_close(l, error) : status;
+}

@@ -1,0 +1,386 @@
+/* What a view makes of a triangle: whether it may be seen, and how many pixels its error takes. */
+#include "dem/framework_pyramid.h"
+#include "lib/base/size.h"
+#include "lib/scene/field.h"
+#include "lib/scene/lod.h"
+
+#include <math.h>
+
+/* The field is farther from a triangle below level 0 than so many standard deviations at one place in a hundred (of a
+ * normal distribution), and those standard deviations are of the place in the triangle where they are largest: over all
+ * places and triangles, of which most are well below the limit that they are tested against, it is one in a thousand.
+ */
+static const double QUANTILE = 2.6;
+/* Strength of the detail that is taken where it is not looked up: in triangles of more than 64 cells, where what
+ * matters is that rough ground among them is not missed. */
+#define WIDE_STRENGTH 2.F
+/* Rises of the surface between neighbouring vertices that do not happen: standard deviations. */
+static const double STEEPEST = 5;
+/* Triangles that look larger than this, radians, are tried by the rules that cost much; smaller ones lie in such. */
+static const double WORTH_IT = .02;
+/* Legs (metres) and widths (degrees of longitude) up to which the triangle's corners tell where it is. */
+static const double LONGEST = 2e4, WIDEST = 8;
+/* A lattice line of at most WIDEST degrees is off its chord by at most tan(WIDEST / 4) / 2 of it; and one of `leg`
+ * metres on a sphere of more than 1.5e6 m by leg^2 / 8 R, twice for both directions. */
+static const double MORE = 1.02, CURVING = 1 / (4 * 1.5e6);
+
+/* ---- Spreads ---- */
+
+/* Variance of fBm of delta 1 about the plane through the corners of a triangle, at the weights w. */
+static double variance_at(const double w[3], double hurst)
+{
+    static const double corner[3][2] = {{0, 0}, {1, 0}, {.5, .5}};
+    double x = w[1] + .5 * w[2], y = .5 * w[2], sum = 0;
+    for (int k = 0; k < 3; k++) {
+        sum += w[k] * pow(hypot(x - corner[k][0], y - corner[k][1]), 2 * hurst);
+        int m = (k + 1) % 3;
+        sum -= w[k] * w[m] * pow(hypot(corner[m][0] - corner[k][0], corner[m][1] - corner[k][1]), 2 * hurst);
+    }
+    return sum;
+}
+
+/* The largest standard deviation of fBm from a triangle with a hypotenuse of 1. */
+static double largest_spread(double hurst)
+{
+    enum { STEPS = 16 };
+    double most = 0;
+    for (int a = 0; a <= STEPS; a++)
+        for (int b = 0; a + b <= STEPS; b++) {
+            const double w[3] = {(double)a / STEPS, (double)b / STEPS, (double)(STEPS - a - b) / STEPS};
+            most = fmax(most, variance_at(w, hurst));
+        }
+    return sqrt(most);
+}
+
+/* Stage of the vertices that split triangles of a depth: they lie at odd multiples of 2^stage. */
+static int stage_of(const lod *l, int depth)
+{
+    return l->lattice_log - 1 - depth / 2;
+}
+
+static int level_of(const lod *l, int depth)
+{
+    return l->levels - stage_of(l, depth);
+}
+
+static void find_spreads(lod *l)
+{
+    const tl_georef *g = &l->dem->info.georef;
+    double mean = sqrt(g->cell_x * g->cell_y), side = fmax(g->cell_x, g->cell_y) / mean;
+    double diagonal = hypot(g->cell_x, g->cell_y) / mean;
+    l->steepest = 0;
+    for (int depth = 2 * l->lattice_log; depth >= 0; depth--) {
+        double cells = ldexp(1, stage_of(l, depth) + 1 - l->levels);
+        l->legs[depth] = cells * (depth & 1 ? .5 * hypot(g->cell_x, g->cell_y) : fmax(g->cell_x, g->cell_y));
+    }
+    for (int depth = 2 * l->lattice_log; depth >= 0; depth--) {
+        int level = level_of(l, depth);
+        double finer = depth + 1 < LOD_DEPTHS ? l->spread[depth + 1] : 0, delta, hurst;
+        l->spread[depth] = finer;
+        if (level < 1 || level > l->field->info.level)
+            continue;
+        scene_field_fractal(l->field, level - 1, &delta, &hurst);
+        double own = delta * largest_spread(hurst) * pow(depth & 1 ? side : diagonal, hurst);
+        l->spread[depth] = fmax(finer, own);
+        l->steepest = fmax(l->steepest, STEEPEST * delta * l->unit / ldexp(mean, 1 - level));
+    }
+}
+
+int lod_block_depth(const lod *l)
+{
+    int depth = 2 * (l->lattice_log - l->levels - SCENE_TILE_LOG);
+    return depth > 0 ? depth : 0;
+}
+
+static void find_planes(lod *l)
+{
+    const scene_camera *c = l->camera;
+    double pixel = 1 / c->focal, across = c->width / 2 / c->focal + pixel, along = c->height / 2 / c->focal + pixel;
+    const double parts[5][3] = {{1, 0, 0}, {across, 1, 0}, {across, -1, 0}, {along, 0, 1}, {along, 0, -1}};
+    for (int k = 0; k < 5; k++) {
+        double length = sqrt(parts[k][0] * parts[k][0] + parts[k][1] * parts[k][1] + parts[k][2] * parts[k][2]);
+        for (int a = 0; a < 3; a++)
+            l->planes[k][a] =
+                (parts[k][0] * c->ahead[a] + parts[k][1] * c->right[a] + parts[k][2] * c->down[a]) / length;
+    }
+}
+
+void lod_prepare_tests(lod *l)
+{
+    find_spreads(l);
+    find_planes(l);
+}
+
+/* ---- One triangle ---- */
+
+typedef struct lying {
+    int32_t x0, y0, x1, y1; /* its box on the lattice */
+    bool outside, over;     /* see dem/framework.h */
+} lying;
+
+static int32_t least(int32_t a, int32_t b, int32_t c)
+{
+    int32_t m = a < b ? a : b;
+    return m < c ? m : c;
+}
+
+static int32_t most(int32_t a, int32_t b, int32_t c)
+{
+    return -least(-a, -b, -c);
+}
+
+/* Its edges run along rows, columns and diagonals, so where it shares no area with the raster, one of these directions
+ * separates them. */
+static lying lie_of(const lod *l, const lod_vertex *const v[3])
+{
+    lying at = {least(v[0]->x, v[1]->x, v[2]->x),
+                least(v[0]->y, v[1]->y, v[2]->y),
+                most(v[0]->x, v[1]->x, v[2]->x),
+                most(v[0]->y, v[1]->y, v[2]->y),
+                false,
+                false};
+    int64_t sum = (int64_t)v[0]->x + v[0]->y;
+    for (int k = 1; k < 3; k++)
+        sum = tl_int64_min(sum, (int64_t)v[k]->x + v[k]->y);
+    at.outside = at.x0 >= l->right || at.y0 >= l->bottom || sum >= (int64_t)l->right + l->bottom;
+    at.over = !at.outside && (at.x1 > l->right || at.y1 > l->bottom);
+    return at;
+}
+
+/* A triangle as the tests see it. Heights in the model's unit. */
+typedef struct subject {
+    lying at;
+    const lod_vertex *v[3];
+    int depth;
+    uint32_t block;
+    double leg; /* metres, the longer one */
+    int void_corners;
+    float low, high; /* of its corners; of those that are void, the place's */
+    double error;    /* of all levels; infinite where it must be split */
+    double reach;    /* how far its surface may be from the plane of its corners */
+    scene_cells cells;
+} subject;
+
+void lod_wide_range(const lod *l, int64_t i0, int64_t j0, int64_t i1, int64_t j1, double *low, double *high)
+{
+    const tl_framework *shape = l->pyramid->shape;
+    int64_t side = shape->block, columns = shape->columns, rows = shape->rows;
+    i0 = tl_int64_min(i0 / side, columns - 1), i1 = tl_int64_min((i1 - 1) / side, columns - 1);
+    j0 = tl_int64_min(j0 / side, rows - 1), j1 = tl_int64_min((j1 - 1) / side, rows - 1);
+    *low = (double)l->low, *high = (double)l->high;
+    if ((i1 - i0 + 1) * (j1 - j0 + 1) > 4)
+        return;
+    double least_z = HUGE_VAL, most_z = -HUGE_VAL;
+    for (int64_t j = j0; j <= j1; j++)
+        for (int64_t i = i0; i <= i1; i++) {
+            const float *range = l->pyramid->ranges + 2 * (j * columns + i);
+            least_z = fmin(least_z, (double)range[0]);
+            most_z = fmax(most_z, (double)range[1]);
+        }
+    if (least_z <= most_z)
+        *low = least_z, *high = most_z;
+}
+
+static const scene_cells wide_cells = {.strength = WIDE_STRENGTH, .rise = HUGE_VALF, .low = 1};
+
+double lod_residual_at(const lod *l, const scene_cells *cells, int depth)
+{
+    cells = cells ? cells : &wide_cells;
+    int level = level_of(l, depth);
+    double noise = QUANTILE * l->spread[depth] * (double)cells->strength, bend = (double)cells->bend;
+    if (l->field->info.level == 0)
+        return 0;
+    if (level > 0) /* a quarter for each halving of the hypotenuse, of which the first is a diagonal */
+        bend = bend / (double)(UINT64_C(1) << (2 * (level - 1) + (depth & 1)));
+    return sqrt(noise * noise + bend * bend);
+}
+
+double lod_residual(const lod *l, const scene_cells *cells)
+{
+    return lod_residual_at(l, cells, 2 * (l->lattice_log - l->levels));
+}
+
+/* Where heights around are all that is known. */
+static void reach_by_range(const lod *l, subject *s)
+{
+    double low, high;
+    lod_wide_range(l, s->at.x0 / l->cell, s->at.y0 / l->cell, tl_div_up(s->at.x1, l->cell),
+                   tl_div_up(s->at.y1, l->cell), &low, &high);
+    s->reach = fmax(high - (double)s->low, (double)s->high - low) + lod_residual_at(l, &s->cells, s->depth);
+}
+
+static void find_error(const lod *l, subject *s, int64_t i, int64_t j)
+{
+    int level = level_of(l, s->depth), log = stage_of(l, s->depth) + 1 - l->levels;
+    s->cells = wide_cells;
+    if (s->block != LOD_NONE)
+        scene_block_at(l->tiles, s->block, s->at.x0 / l->cell, s->at.y0 / l->cell, log > 0 ? log : 0, &s->cells);
+    s->error = lod_residual_at(l, &s->cells, s->depth);
+    s->reach = s->error;
+    if (level > 0) {
+        if (s->void_corners)
+            reach_by_range(l, s);
+        return;
+    }
+    double own = s->at.over ? HUGE_VAL : tl_pyramid_error(l->pyramid, i, j);
+    s->error += own;
+    s->reach = s->error;
+    if (!(own < HUGE_VAL))
+        reach_by_range(l, s);
+}
+static subject subject_of(const lod *l, const lod_triangle *t, int depth)
+{
+    subject s = {.v = {lod_at(l, t->a), lod_at(l, t->b), lod_at(l, t->apex)}, .depth = depth, .block = t->block};
+    s.at = lie_of(l, s.v);
+    s.low = HUGE_VALF, s.high = -HUGE_VALF;
+    for (int k = 0; k < 3; k++)
+        s.void_corners += isnan(s.v[k]->z);
+    for (int k = 0; k < (s.void_corners ? 2 : 3); k++) { /* see look_at */
+        float z = isnan(s.v[k]->z) ? l->filling : s.v[k]->z;
+        s.low = z < s.low ? z : s.low;
+        s.high = z > s.high ? z : s.high;
+    }
+    s.leg = l->legs[depth];
+    return s;
+}
+
+/* Where it is, and how near. */
+typedef struct sight {
+    double distance;
+    unsigned hidden; /* tl_culling */
+} sight;
+
+/* Beside the screen, by a ball around it. */
+static bool beside(const lod *l, const double middle[3], double radius)
+{
+    for (int k = 0; k < 5; k++) {
+        const double *n = l->planes[k];
+        if (n[0] * middle[0] + n[1] * middle[1] + n[2] * middle[2] < -radius)
+            return true;
+    }
+    return false;
+}
+
+static double steepness(const lod *l, const subject *s)
+{
+    if (s->block == LOD_NONE || !(s->cells.rise < HUGE_VALF))
+        return HUGE_VAL;
+    return 1.5 * (double)s->cells.rise * l->unit / fmin(l->metres_x, l->metres_y) +
+           l->steepest * (double)s->cells.strength;
+}
+
+static scene_extent extent_of(const lod *l, const subject *s)
+{
+    scene_extent e = {(double)s->at.x0 / l->cell,
+                      (double)s->at.y0 / l->cell,
+                      fmin((double)s->at.x1, (double)l->right) / l->cell,
+                      fmin((double)s->at.y1, (double)l->bottom) / l->cell,
+                      (double)s->low - s->reach,
+                      (double)s->high + s->reach};
+    return e;
+}
+
+/* By boxes: for what is large, and for rules that cost much. */
+static sight look_at_box(const lod *l, const subject *s, unsigned rules)
+{
+    scene_extent extent = extent_of(l, s);
+    scene_box box;
+    sight out = {0, 0};
+    scene_view_box(l->view, &extent, &box);
+    out.hidden = scene_view_hides(l->view, &extent, &box, steepness(l, s),
+                                  rules & (TL_CULL_FRUSTUM | TL_CULL_BACK | TL_CULL_HORIZON));
+    out.distance = scene_view_distance(l->view, &box);
+    return out;
+}
+
+static bool behind_ridge(const lod *l, const subject *s)
+{
+    int log = stage_of(l, s->depth) + 1 - l->levels;
+    return l->ridges && !(s->depth & 1) && log >= 0 &&
+           lod_ridges_hide(l->ridges, s->at.x0 / l->cell, s->at.y0 / l->cell, log);
+}
+
+static sight look_at(const lod *l, const subject *s, unsigned rules)
+{
+    if (s->at.over || s->leg > LONGEST || l->degrees * (s->at.x1 - s->at.x0) / l->cell > WIDEST) {
+        sight wide = look_at_box(l, s, rules);
+        if (!wide.hidden && rules & TL_CULL_RIDGE && behind_ridge(l, s))
+            wide.hidden = TL_CULL_RIDGE;
+        return wide;
+    }
+    const float *a = s->v[0]->at, *b = s->v[1]->at, *apex = s->v[2]->at;
+    double middle[3], to_a = 0, to_apex = 0, far = 0;
+    for (int k = 0; k < 3; k++) {
+        middle[k] = .5 * ((double)a[k] + (double)b[k]);
+        to_a += ((double)a[k] - middle[k]) * ((double)a[k] - middle[k]);
+        to_apex += ((double)apex[k] - middle[k]) * ((double)apex[k] - middle[k]);
+        far += middle[k] * middle[k];
+    }
+    far = sqrt(far);
+    if (s->void_corners) /* the other diagonal may be drawn, by whichever half of the square: see both alike */
+        to_apex = 1.1 * to_a;
+    double radius = MORE * sqrt(fmax(to_a, to_apex)) + CURVING * s->leg * s->leg + s->reach * l->unit + 1e-6 * far;
+    sight out = {fmax(0, far - radius), 0};
+    if (rules & TL_CULL_FRUSTUM && beside(l, middle, radius))
+        out.hidden = TL_CULL_FRUSTUM;
+    else if (!(s->depth & 1) && rules & (TL_CULL_BACK | TL_CULL_HORIZON) && s->leg > WORTH_IT * far)
+        out.hidden = look_at_box(l, s, rules & ~(unsigned)TL_CULL_FRUSTUM).hidden;
+    if (!out.hidden && rules & TL_CULL_RIDGE && behind_ridge(l, s))
+        out.hidden = TL_CULL_RIDGE;
+    return out;
+}
+
+/* Whether cells are to be smaller, by distance alone. */
+static bool out_of_band(const lod *l, int depth, double distance)
+{
+    const tl_lod_options *o = l->options;
+    size_t k = 0;
+    while (k < o->band_count && distance > o->bands[k])
+        k++;
+    return stage_of(l, depth) + 1 + l->field->info.level - l->levels > (int)k;
+}
+
+bool lod_wants(const lod *l, int depth, double error, double distance)
+{
+    if (level_of(l, depth) > l->finest)
+        return false;
+    return l->options->band_count ? out_of_band(l, depth, distance)
+                                  : scene_view_pixels(l->view, error, distance) > l->pixel_error;
+}
+
+/* Whether a triangle wants to be split for its chunk; finds that, and whether it is hidden. */
+static bool wants_for_chunk(const lod *l, const subject *s, const lod_triangle *t, lod_verdict *out)
+{
+    int stage = stage_of(l, s->depth), step = t->step - 1;
+    unsigned hidden = 0;
+    if (!t->step && !(s->depth & 1) && lod_chunk_says(l->chunks, s->at.x0, s->at.y0, stage + 1, &step, &hidden)) {
+        if (hidden)
+            *out = (lod_verdict){.state = LOD_HIDDEN, .rule = (unsigned char)hidden};
+    }
+    out->step = (signed char)(step + 1);
+    return step < 0 || stage >= step;
+}
+
+lod_verdict lod_test(const lod *l, const lod_triangle *t, int depth, unsigned rules)
+{
+    subject s = subject_of(l, t, depth);
+    int stage = stage_of(l, depth), level = l->levels - stage;
+    int32_t x, y;
+    lod_middle(l, t, &x, &y);
+    bool ends = stage < 0; /* legs of 1 */
+    if (s.at.outside)
+        return (lod_verdict){.state = LOD_DROPPED};
+    find_error(l, &s, x / l->cell, y / l->cell);
+    if (s.void_corners && (level > 0 || s.error < HUGE_VAL) && (level <= 0 || s.void_corners > 1))
+        return (lod_verdict){.state = LOD_DROPPED};
+    sight seen = look_at(l, &s, rules);
+    if (seen.hidden)
+        return (lod_verdict){.state = LOD_HIDDEN, .rule = (unsigned char)seen.hidden};
+    bool forced = !(s.error < HUGE_VAL), can = !ends && !(level > 0 && s.void_corners);
+    lod_verdict out = {.pixels =
+                           forced ? HUGE_VALF : (float)scene_view_pixels(l->view, s.error * l->unit, seen.distance)};
+    bool wants = l->chunks ? wants_for_chunk(l, &s, t, &out) : lod_wants(l, depth, s.error * l->unit, seen.distance);
+    if (out.state != LOD_HIDDEN)
+        out.state = can && (forced || wants) ? LOD_SPLIT : LOD_LEAF;
+    return out;
+}
