@@ -7,6 +7,7 @@
 
 #include <math.h>
 #include <stdlib.h>
+#include <string.h>
 
 enum { MOST_VIEWS = 1024 };
 
@@ -76,8 +77,8 @@ tl_status tl_view_write_picture(const tl_mesh *mesh, const tl_source *dem, const
         return tl_fail(error, TL_ERROR_ARGUMENT, "%s: %zu views were asked for; 1...%d make a picture", path, count,
                        MOST_VIEWS);
     const tl_format *format = options->depth ? tl_format_of(options->depth) : NULL;
-    if (options->depth && !(format && format->grid))
-        return tl_fail(error, TL_ERROR_ARGUMENT, "%s: depths go into a grid, as .exr", options->depth);
+    if (options->depth && !(format && strcmp(format->ending, "exr") == 0))
+        return tl_fail(error, TL_ERROR_ARGUMENT, "%s: depths go into an .exr", options->depth);
     tl_output *output = tl_output_open(path, options->overwrite, error);
     if (!output)
         return error->status;
