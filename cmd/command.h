@@ -15,7 +15,8 @@ typedef struct command {
     int (*run)(const struct command *self, int argc, const char **argv, bool help);
 } command;
 
-extern const command command_info, command_simplify, command_synth, command_preview, command_noise, command_stats;
+extern const command command_info, command_simplify, command_synth, command_preview, command_noise, command_stats,
+    command_view;
 
 enum { DEFAULT_MEMORY = 512, OPENED_STEPS = 4 };
 

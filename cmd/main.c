@@ -6,8 +6,8 @@
 #include <string.h>
 #include <unistd.h>
 
-static const command *const commands[] = {&command_info,    &command_simplify, &command_synth,
-                                          &command_preview, &command_noise,    &command_stats};
+static const command *const commands[] = {&command_info,  &command_simplify, &command_synth, &command_preview,
+                                          &command_noise, &command_stats,    &command_view};
 enum { COMMAND_COUNT = sizeof commands / sizeof *commands };
 
 static const command *find(const char *name)
