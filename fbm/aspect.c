@@ -252,25 +252,34 @@ int fbm_aspect_halvings(double aspect)
     return k;
 }
 
+/* The two half steps, and where they are in the values. */
+static const struct {
+    const stencil *stencil;
+    int w, t;
+} half_steps[2] = {{&centre_stencil, 0, 6}, {&edge_stencil, 10, 18}};
+
+void fbm_values_kriging(double hurst, double aspect, double values[FBM_WEIGHT_VALUES])
+{
+    model m = {fbm_hurst_clamp(hurst), aspect};
+    for (int p = 0; p < 2; p++)
+        krige_with_taps(&m, half_steps[p].stencil, values + half_steps[p].w, values + half_steps[p].t);
+    values[22] = values[18];
+}
+
 void fbm_values_stationary(double hurst, double aspect, double values[FBM_WEIGHT_VALUES])
 {
     fbm_values_table(hurst, values);
     if (aspect == 1)
         return;
-    static const struct {
-        const stencil *stencil;
-        int w, t; /* where they are in the values */
-    } parts[2] = {{&centre_stencil, 0, 6}, {&edge_stencil, 10, 18}};
-    model here = {fbm_hurst_clamp(hurst), aspect}, square = {here.hurst, 1};
+    double here[FBM_WEIGHT_VALUES], square[FBM_WEIGHT_VALUES];
+    fbm_values_kriging(hurst, aspect, here);
+    fbm_values_kriging(hurst, 1, square);
     for (int p = 0; p < 2; p++) {
-        const stencil *s = parts[p].stencil;
-        double w[2][ORBITS], t[2][TAPS], *value = values + parts[p].w, *tap = values + parts[p].t;
-        krige_with_taps(&here, s, w[0], t[0]);
-        krige_with_taps(&square, s, w[1], t[1]);
-        for (int k = 0; k < s->orbits; k++)
-            value[k] += w[0][k] - w[1][k];
-        for (int k = 0; k < s->taps; k++)
-            tap[k] = t[0][k] + (tap[k] - t[1][k]) * t[0][0] / t[1][0];
+        int w = half_steps[p].w, t = half_steps[p].t;
+        for (int k = w; k < w + half_steps[p].stencil->orbits; k++)
+            values[k] += here[k] - square[k];
+        for (int k = t; k < t + half_steps[p].stencil->taps; k++)
+            values[k] = here[k] + (values[k] - square[k]) * here[t] / square[t];
     }
     values[22] = values[18];
 }

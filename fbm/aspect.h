@@ -25,6 +25,9 @@ int fbm_aspect_halvings(double aspect);
 /* Coefficients of the `stationary` scheme at an aspect of 1/2 ... 2. At 1 they are the table's. About 2 ms. */
 void fbm_values_stationary(double hurst, double aspect, double values[FBM_WEIGHT_VALUES]);
 
+/* The same by kriging alone, without the table. */
+void fbm_values_kriging(double hurst, double aspect, double values[FBM_WEIGHT_VALUES]);
+
 /* Coefficients of a step that halves the rows' spacing: new samples at (i, j + 1/2), by orbits (columns, rows off it):
  *   w    (0, 1/2) (1, 1/2) (2, 1/2) (3, 1/2) (0, 3/2) (1, 3/2) (2, 3/2)
  *   taps (0, 0) (1, 0) (2, 0) (0, 1) (1, 1) (2, 1) (3, 0)

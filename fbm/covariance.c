@@ -228,16 +228,36 @@ static void add_noise(analysis *a, int stage)
 }
 /* ---- Result ------------------------------------------------------------------------------------ */
 
+/* |h|^(2H) of an increment. */
+static double theory_of(const analysis *a, int dx, int dy)
+{
+    double rows = (double)dy / (1 << a->refinement->halvings);
+    return pow(hypot(dx * a->refinement->aspect, rows) / (1 << a->levels), 2 * a->refinement->hurst);
+}
+
+static void visit_all(const analysis *a, fbm_increment_visit visit, void *context)
+{
+    size_t points = (size_t)a->width * (size_t)a->height;
+    for (int d = 0; d < DIRECTIONS; d++)
+        for (int lag = 1; lag <= a->lags; lag++) {
+            int dx = lag * directions[d][0], dy = lag * directions[d][1];
+            double theory = theory_of(a, dx, dy);
+            const double *v = a->variances + (size_t)(d * a->lags + lag - 1) * points;
+            for (int y = most(0, -dy); y < a->height - most(0, dy); y++)
+                for (int x = 0; x < a->width - dx; x++)
+                    visit(context, dx, dy, x, y, v[y * a->width + x] / theory);
+        }
+}
+
 static void summarise(const analysis *a, fbm_deviation *out)
 {
-    int n = a->width, m = a->height, halvings = a->refinement->halvings;
+    int n = a->width, m = a->height;
     double lowest = HUGE_VAL, highest = 0;
     *out = (fbm_deviation){.ratio = 1};
     for (int d = 0; d < DIRECTIONS; d++)
         for (int lag = 1; lag <= a->lags; lag++) {
             int dx = lag * directions[d][0], dy = lag * directions[d][1];
-            double length = hypot(dx * a->refinement->aspect, (double)dy / (1 << halvings)) / (1 << a->levels);
-            double theory = pow(length, 2 * a->refinement->hurst);
+            double theory = theory_of(a, dx, dy);
             double low = HUGE_VAL, high = 0, sum = 0;
             const double *v = a->variances + (size_t)(d * a->lags + lag - 1) * (size_t)n * (size_t)m;
             for (int y = most(0, -dy); y < m - most(0, dy); y++)
@@ -302,7 +322,9 @@ static void plan(analysis *a, int cells)
     a->kernel.noise = impulse_noise;
 }
 
-fbm_status fbm_refinement_deviation(const fbm_refinement *r, int levels, int cells, fbm_deviation *out)
+/* Hands over to `visit`, or summarises to `out` where that is NULL. */
+static fbm_status analyse(const fbm_refinement *r, int levels, int cells, fbm_increment_visit visit, void *context,
+                          fbm_deviation *out)
 {
     if (levels < 1 || levels > LEVELS || cells < 1 || cells > CELLS || r->halvings < 0 || r->halvings > HALVINGS ||
         cells << (levels + r->halvings) >= SIDE)
@@ -317,10 +339,24 @@ fbm_status fbm_refinement_deviation(const fbm_refinement *r, int levels, int cel
         each_increment(&a, (box){0, 0, a.width - 1, a.height - 1}, add_input_variance);
         for (int s = 0; s < a.stages; s++)
             add_noise(&a, s);
-        summarise(&a, out);
+        if (visit)
+            visit_all(&a, visit, context);
+        else
+            summarise(&a, out);
     }
     release(&a);
     return good ? FBM_OK : FBM_NO_MEMORY;
+}
+
+fbm_status fbm_refinement_deviation(const fbm_refinement *refinement, int levels, int cells, fbm_deviation *out)
+{
+    return analyse(refinement, levels, cells, NULL, NULL, out);
+}
+
+fbm_status fbm_refinement_increments(const fbm_refinement *refinement, int levels, int cells, fbm_increment_visit visit,
+                                     void *context)
+{
+    return analyse(refinement, levels, cells, visit, context, NULL);
 }
 
 fbm_status fbm_structure_deviation(const fbm_scheme *scheme, const fbm_weights *weights, double hurst, int levels,

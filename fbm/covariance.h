@@ -35,4 +35,10 @@ typedef struct fbm_refinement {
 
 fbm_status fbm_refinement_deviation(const fbm_refinement *refinement, int levels, int cells, fbm_deviation *out);
 
+/* Hands over every increment that fbm_refinement_deviation looks at: over (dx, dy) samples from (x, y), and its S over
+ * the theory's. */
+typedef void (*fbm_increment_visit)(void *context, int dx, int dy, int x, int y, double relative);
+fbm_status fbm_refinement_increments(const fbm_refinement *refinement, int levels, int cells, fbm_increment_visit visit,
+                                     void *context);
+
 #endif

@@ -8,7 +8,8 @@
 
 /* The tuned table, reference data of the project (weights24.csv): for each H the coefficients of the 24-point
  * predictor and of the 3 x 3 residual filter that bring the exactly propagated structure function of repeated
- * refinement closest to fBm's at all positions and lags. */
+ * refinement closest to fBm's at all positions and lags. fbm/tune.h derives such rows again: `ninja weights-table` prints
+ * them, and how good both are; doc/accuracy.md has the comparison. */
 enum { KNOTS = 25, COLUMNS = 7 };
 
 static const double table[KNOTS][1 + COLUMNS] = {
@@ -146,8 +147,9 @@ void fbm_weights_round(const double values[FBM_WEIGHT_VALUES], fbm_weights *out)
 
 /* Coefficients of the square's symmetry {w0 ... w3; t0 ... t2} as those of the rectangle's; edges see the centres'
  * picture turned by 45 degrees, where axes and diagonals change places. */
-static void spread(const double w[4], const double t[3], double turn, double *values)
+void fbm_values_of_row(const fbm_table_row *row, double values[FBM_WEIGHT_VALUES])
 {
+    const double *w = row->w, *t = row->t, turn = fbm_exp2(-row->hurst / 2);
     const double all[FBM_WEIGHT_VALUES] = {
         w[0], w[1], w[1], w[2], w[3], w[3], t[0],        t[1],        t[1],        t[2],        w[0],       w[0],
         w[1], w[1], w[2], w[2], w[3], w[3], turn * t[0], turn * t[1], turn * t[2], turn * t[2], turn * t[0]};
@@ -155,32 +157,52 @@ static void spread(const double w[4], const double t[3], double turn, double *va
         values[k] = all[k];
 }
 
+bool fbm_table_row_at(int knot, fbm_table_row *out)
+{
+    if (knot < 0 || knot >= KNOTS)
+        return false;
+    const double *row = table[knot];
+    *out = (fbm_table_row){row[0], {row[1], row[2], row[3], row[4]}, {row[5], row[6], row[7]}};
+    return true;
+}
+
+static fbm_table_row row_between(double hurst)
+{
+    fbm_table_row row = {.hurst = fbm_hurst_clamp(hurst)};
+    for (int k = 0; k < 4; k++)
+        row.w[k] = interpolate(k, row.hurst);
+    for (int k = 0; k < 3; k++)
+        row.t[k] = interpolate(4 + k, row.hurst);
+    return row;
+}
+
 void fbm_values_table(double hurst, double values[FBM_WEIGHT_VALUES])
 {
-    hurst = fbm_hurst_clamp(hurst);
-    double w[4], t[3];
-    for (int k = 0; k < 4; k++)
-        w[k] = interpolate(k, hurst);
-    for (int k = 0; k < 3; k++)
-        t[k] = interpolate(4 + k, hurst);
-    spread(w, t, fbm_exp2(-hurst / 2), values);
+    fbm_table_row row = row_between(hurst);
+    fbm_values_of_row(&row, values);
 }
 
 /* Orbits of the square's symmetry keep their equality when they are rounded: what the others' rounding costs goes to
  * the orbit that weighs least, whose own rounding is the smallest. Else every level would shift a plateau at 4,000 m by
  * up to a millimetre. */
-void fbm_weights_stationary(double hurst, fbm_weights *out)
+void fbm_weights_of_row(const fbm_table_row *row, fbm_weights *out)
 {
     static const double orbits[4] = {4, 8, 4, 8};
     double values[FBM_WEIGHT_VALUES];
     float w[4];
-    fbm_values_table(hurst, values);
+    fbm_values_of_row(row, values);
     fbm_round_predictor((const double[]){values[0], values[1], values[3], values[4]}, orbits, 4, w);
     fbm_weights_round(values, out);
     const float centre[6] = {w[0], w[1], w[1], w[2], w[3], w[3]};
     const float edge[8] = {w[0], w[0], w[1], w[1], w[2], w[2], w[3], w[3]};
     memcpy(out->centre, centre, sizeof centre);
     memcpy(out->edge, edge, sizeof edge);
+}
+
+void fbm_weights_stationary(double hurst, fbm_weights *out)
+{
+    fbm_table_row row = row_between(hurst);
+    fbm_weights_of_row(&row, out);
 }
 
 /* h^(2H) of a distance, by its square. */

@@ -2,6 +2,7 @@
 #ifndef FBM_WEIGHTS_H
 #define FBM_WEIGHTS_H
 
+#include <stdbool.h>
 #include <stddef.h>
 
 /* The Hurst exponents that the table covers; others are clamped to this range. */
@@ -45,6 +46,19 @@ void fbm_weights_round(const double values[FBM_WEIGHT_VALUES], fbm_weights *out)
 void fbm_weights_stationary(double hurst, fbm_weights *out);
 /* The same as values, not rounded. */
 void fbm_values_table(double hurst, double values[FBM_WEIGHT_VALUES]);
+
+/* A row of such a table: coefficients of the square's symmetry. Predictor, for points at (1/2, 1/2), (3/2, 1/2),
+ * (3/2, 3/2) and (5/2, 1/2) from the centre; taps at (0, 0), (1, 0) and (1, 1). Edges see the same picture turned. */
+typedef struct fbm_table_row {
+    double hurst, w[4], t[3];
+} fbm_table_row;
+
+/* The row of the table at one of its knots, which are numbered from 0; false behind the last one. fbm/tune.h makes such
+ * rows. */
+bool fbm_table_row_at(int knot, fbm_table_row *out);
+void fbm_values_of_row(const fbm_table_row *row, double values[FBM_WEIGHT_VALUES]);
+/* Rounds such that orbits of the square's symmetry stay equal, and predictors add up to 1. */
+void fbm_weights_of_row(const fbm_table_row *row, fbm_weights *out);
 
 /* The classical schemes, for comparison: each new point is a mean of its neighbours, plus independent noise with the
  * variance of fBm about that mean in two dimensions. For points p of weights w that add up to 1 it is

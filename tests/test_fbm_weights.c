@@ -1,5 +1,8 @@
 /* Coefficients of the refinement schemes. */
+#include "fbm/aspect.h"
+#include "fbm/covariance.h"
 #include "fbm/refine.h"
+#include "fbm/tune.h"
 #include "fbm/weights.h"
 
 #include <math.h>
@@ -187,6 +190,39 @@ static void schemesAreFoundByName(void **state)
     assert_null(fbm_scheme_find(""));
 }
 
+/* The generator, on a window smaller than the table was made for: at the lags that it sees, it comes down from kriging
+ * to deviations that are no worse than the table's there. */
+static void tuningComesDownToTheTable(void **state)
+{
+    (void)state;
+    for (int k = 0; k < 2; k++) {
+        double values[FBM_WEIGHT_VALUES], hurst = k ? 0.8 : 0.3;
+        fbm_table_row tuned, known;
+        fbm_deviation krigeds, tuneds, knowns;
+        fbm_weights weights;
+        assert_int_equal(fbm_tune(hurst, 2, 2, &tuned), FBM_OK);
+        fbm_weights_of_row(&tuned, &weights);
+        assert_int_equal(fbm_structure_deviation(fbm_schemes, &weights, hurst, 2, 2, &tuneds), FBM_OK);
+        fbm_values_kriging(hurst, 1, values);
+        fbm_weights_round(values, &weights);
+        assert_int_equal(fbm_structure_deviation(fbm_schemes, &weights, hurst, 2, 2, &krigeds), FBM_OK);
+        int knot = 0;
+        while (fbm_table_row_at(knot, &known) && known.hurst != hurst)
+            knot++;
+        fbm_weights_of_row(&known, &weights);
+        assert_int_equal(fbm_structure_deviation(fbm_schemes, &weights, hurst, 2, 2, &knowns), FBM_OK);
+        assert_true(tuneds.point < krigeds.point && tuneds.point <= knowns.point);
+        for (int i = 0; i < 4; i++)
+            assert_true(fabs(tuned.w[i] - known.w[i]) < 0.01);
+        for (int i = 0; i < 3; i++)
+            assert_true(fabs(tuned.t[i] - known.t[i]) < 0.005);
+    }
+    fbm_table_row none;
+    assert_false(fbm_table_row_at(25, &none) || fbm_table_row_at(-1, &none));
+    assert_int_equal(fbm_tune(0.5, 0, 2, &none), FBM_TOO_LARGE);
+    assert_int_equal(fbm_tune(0.5, 3, 5, &none), FBM_TOO_LARGE);
+}
+
 int main(void)
 {
     const struct CMUnitTest tests[] = {
@@ -200,6 +236,7 @@ int main(void)
         cmocka_unit_test(stretchedWeightsTurn),
         cmocka_unit_test(classicalVariancesAreThoseOfTwoDimensions),
         cmocka_unit_test(schemesAreFoundByName),
+        cmocka_unit_test(tuningComesDownToTheTable),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }
