@@ -12,7 +12,7 @@ typedef struct settings {
     common common;
     double max_error; /* asked for; or what a budget comes to */
     bool max_error_given, verify;
-    int frame, mesh, borders, diagonal;
+    int frame, mesh, borders, diagonal, coding;
     double skirt, base;
     int64_t triangles, vertices; /* budgets; 0: none */
     const char *keep;
@@ -37,6 +37,16 @@ static const char *const diagonal_names[] = {
 enum { FEATURES_NONE, FEATURES_POINTS, FEATURES_LINES };
 static const char *const feature_names[] = {
     [FEATURES_NONE] = "none", [FEATURES_POINTS] = "points", [FEATURES_LINES] = "lines", NULL};
+
+static const char *const coding_names[] = {
+    [TL_CODING_PLAIN] = "float", [TL_CODING_QUANTIZED] = "quantized", [TL_CODING_COMPRESSED] = "meshopt", NULL};
+
+/* What the numbers of the output file round. */
+static tl_rounding file_rounding(const settings *set, const tl_source *dem)
+{
+    tl_write_options options = {.frame = (tl_frame)set->frame, .coding = (tl_mesh_coding)set->coding};
+    return tl_write_rounding(&dem->info, set->common.output, &options);
+}
 
 static int report_check(const settings *set, const tl_mesh_report *check)
 {
@@ -81,7 +91,10 @@ static int write_and_check(const settings *set, const tl_source *dem, tl_mesh *m
     tl_error error;
     tl_mesh_report check = {0};
     progress_stage(bar, "writing");
-    tl_write_options options = {.overwrite = set->common.overwrite, .frame = (tl_frame)set->frame, .run = run};
+    tl_write_options options = {.overwrite = set->common.overwrite,
+                                .frame = (tl_frame)set->frame,
+                                .coding = (tl_mesh_coding)set->coding,
+                                .run = run};
     if (add_below(set, mesh, &error) != TL_OK || tl_write_mesh(mesh, set->common.output, &options, &error) != TL_OK)
         return command_failed(bar, &error);
     progress_end(bar);
@@ -152,7 +165,7 @@ static tl_pyramid *make_pyramid(const settings *set, const tl_source *dem, const
 {
     tl_pyramid_options options = {.frame = mesh_frame(set), .run = run};
     if (!set->points)
-        options.rounding = tl_write_rounding(&dem->info, set->common.output, (tl_frame)set->frame);
+        options.rounding = file_rounding(set, dem);
     tl_write_options writing = {.overwrite = true, .run = run};
     tl_status status;
     tl_pyramid *pyramid = load_pyramid(set, dem, &options, &status, error);
@@ -193,7 +206,7 @@ static tl_framework *make_framework(settings *set, const tl_source *dem, const t
     tl_framework_options options = {
         .max_error = set->max_error, .frame = mesh_frame(set), .features = features, .run = run};
     if (!set->points)
-        options.rounding = tl_write_rounding(&dem->info, set->common.output, (tl_frame)set->frame);
+        options.rounding = file_rounding(set, dem);
     tl_framework *framework = by_pyramid(set) || too_large(set, dem, run)
                                   ? select_framework(set, dem, features, run, error)
                                   : tl_framework_build(dem, &options, error);
@@ -214,7 +227,7 @@ static tl_status make_mesh(settings *set, const tl_source *dem, const tl_feature
     }
     tl_simplify_options options = {.max_error = set->max_error,
                                    .frame = (tl_frame)set->frame,
-                                   .rounding = tl_write_rounding(&dem->info, set->common.output, (tl_frame)set->frame),
+                                   .rounding = file_rounding(set, dem),
                                    .kind = (tl_mesh_kind)set->mesh,
                                    .canonical_borders = set->borders == BORDERS_CANONICAL,
                                    .run = run};
@@ -227,10 +240,8 @@ static tl_status turn_diagonals(const settings *set, const tl_source *dem, const
 {
     if (set->diagonal == DIAGONAL_LONGEST_EDGE)
         return TL_OK;
-    tl_diagonal_options options = {.max_error = set->max_error,
-                                   .frame = (tl_frame)set->frame,
-                                   .rounding = tl_write_rounding(&dem->info, set->common.output, (tl_frame)set->frame),
-                                   .run = run};
+    tl_diagonal_options options = {
+        .max_error = set->max_error, .frame = (tl_frame)set->frame, .rounding = file_rounding(set, dem), .run = run};
     tl_diagonal_report found;
     tl_status status = tl_mesh_lower_diagonals(mesh, dem, &options, &found, error);
     if (status == TL_OK)
@@ -394,6 +405,12 @@ static bool is_tiff(const char *path)
     return dot && (strcasecmp(dot, ".tif") == 0 || strcasecmp(dot, ".tiff") == 0);
 }
 
+static bool is_glb(const char *path)
+{
+    const char *dot = path ? strrchr(path, '.') : NULL;
+    return dot && strcasecmp(dot, ".glb") == 0;
+}
+
 static bool points_output_ok(const settings *set)
 {
     static const char *const endings[] = {".geojson", ".json", ".csv", ".ply", ".tif", ".tiff"};
@@ -427,6 +444,8 @@ static bool settings_ok(settings *set)
     else if (set->diagonal != DIAGONAL_LONGEST_EDGE && (set->points || set->mesh != TL_MESH_QUADTREE || set->error_map))
         complain("--diagonal lower is for quadtree meshes under one bound; leave --mesh, --points and --max-error-map "
                  "away");
+    else if (set->coding != TL_CODING_PLAIN && !is_glb(set->common.output))
+        complain("--coding is for .glb; other formats have but one");
     else if (set->features && !set->max_error_given)
         complain("--features needs --max-error E, which tells what matters");
     else if (set->points && (set->skirt > 0 || set->base > 0))
@@ -474,6 +493,10 @@ static int run(const command *self, int argc, const char **argv, bool help)
          NULL},
         {"error-cache", 0, OPTION_TEXT, &set.error_cache, NULL, "FILE",
          "a GeoTIFF that keeps what every bound and budget needs: used again while the DEM stays the same", 0, 0, NULL},
+        {"coding", 0, OPTION_CHOICE, &set.coding, NULL, "CODING",
+         "of a .glb: float, quantized (positions in 16 bits, which count into the bound), or meshopt (these "
+         "compressed; default: float)",
+         0, 0, coding_names},
         {"verify", 0, OPTION_FLAG, &set.verify, NULL, NULL,
          "read the written file back and measure it against every sample", 0, 0, NULL},
         {"frame", 0, OPTION_CHOICE, &set.frame, NULL, "FRAME",

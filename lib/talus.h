@@ -918,6 +918,13 @@ typedef enum tl_mip {
     TL_MIP_BOX,     /* means of 2 x 2 samples, of those that are known */
 } tl_mip;
 
+/* How a GLB keeps positions. */
+typedef enum tl_mesh_coding {
+    TL_CODING_PLAIN = 0,  /* single precision */
+    TL_CODING_QUANTIZED,  /* steps of 16 bits from the mesh's lowest corner, by KHR_mesh_quantization: half the size */
+    TL_CODING_COMPRESSED, /* the same, encoded by EXT_meshopt_compression: a tenth, for readers that know it */
+} tl_mesh_coding;
+
 typedef struct tl_write_options {
     bool overwrite; /* replace an existing file; else TL_ERROR_IO */
     bool validity;  /* of grids, not meshes: also write each sample's tl_validity, to NAME.validity.tif for NAME.exr */
@@ -925,6 +932,7 @@ typedef struct tl_write_options {
     tl_mip mip; /* EXR only: a mipmap down to one sample, its sizes rounded up. It is gathered in memory, a third of the
                    grid */
     tl_frame frame;
+    tl_mesh_coding coding; /* of meshes in GLB; others keep theirs */
     const tl_run *run;
 } tl_write_options;
 
@@ -938,9 +946,9 @@ TL_API tl_status tl_write_grid(const tl_source *source, const char *path, const 
  * its first vertex, which its header names: single precision is too coarse for them. */
 TL_API tl_status tl_write_mesh(const tl_mesh *mesh, const char *path, const tl_write_options *options, tl_error *error);
 
-/* A bound of the rounding in a mesh file of this name over a grid: none where its numbers hold what the frame asks for.
- */
-TL_API tl_rounding tl_write_rounding(const tl_source_info *grid, const char *path, tl_frame frame);
+/* A bound of the rounding in a mesh file of this name over a grid, by the options' frame and coding: none where its
+ * numbers hold what the frame asks for. */
+TL_API tl_rounding tl_write_rounding(const tl_source_info *grid, const char *path, const tl_write_options *options);
 /* Reads back the file that tl_write_mesh made of `mesh` in `frame`, and compares it with every sample of the source as
  * tl_mesh_verify_in does, but with the numbers that the file has. Triangles that are upright or look down, walls and
  * floors, count for nothing. `bounds`, unless NULL, holds the bound, or the map of bounds, that the samples are held to

@@ -46,17 +46,23 @@ static tl_source *open_hills(grid *of, bool holes)
     return source;
 }
 
-static tl_mesh *write_mesh(const tl_source *source, double max_error, const char *path, tl_frame frame)
+static tl_mesh *write_coded(const tl_source *source, double max_error, const char *path, tl_frame frame,
+                            tl_mesh_coding coding)
 {
     tl_framework *framework = tl_framework_build(source, &(tl_framework_options){.max_error = max_error}, NULL);
     tl_mesh *mesh = NULL;
     tl_error error = {0};
     assert_int_equal(tl_framework_mesh(framework, &mesh, NULL), TL_OK);
-    tl_write_options options = {.overwrite = true, .frame = frame};
+    tl_write_options options = {.overwrite = true, .frame = frame, .coding = coding};
     if (tl_write_mesh(mesh, path, &options, &error) != TL_OK)
         fail_msg("%s", error.text);
     tl_framework_destroy(framework);
     return mesh;
+}
+
+static tl_mesh *write_mesh(const tl_source *source, double max_error, const char *path, tl_frame frame)
+{
+    return write_coded(source, max_error, path, frame, TL_CODING_PLAIN);
 }
 
 /* The file has the error that the mesh has, but for what rounding of its numbers adds. */
@@ -162,6 +168,49 @@ static void samplesAreHeldToTheirOwnBounds(void **state)
     free(map.z);
 }
 
+/* Positions in steps are off by what tl_write_rounding says at most; encoding them loses nothing. */
+static void stepsAddWhatIsSaid(void **state)
+{
+    static const tl_frame frames[] = {TL_FRAME_PIXEL, TL_FRAME_PROJECTED};
+    (void)state;
+    const char *path = path_of("glb");
+    for (int round = 0; round < 8; round++) {
+        grid of;
+        random_state = (uint64_t)round;
+        tl_source *source = open_hills(&of, round & 4);
+        tl_mesh_report own, read[2];
+        tl_error error = {0};
+        for (int coding = TL_CODING_QUANTIZED; coding <= TL_CODING_COMPRESSED; coding++) {
+            tl_mesh *mesh = write_coded(source, 3, path, frames[round & 1], (tl_mesh_coding)coding);
+            assert_int_equal(tl_mesh_verify(mesh, source, NULL, &own, NULL), TL_OK);
+            if (tl_mesh_verify_file(path, mesh, source, NULL, frames[round & 1], NULL, &read[coding - 1], &error) !=
+                TL_OK)
+                fail_msg("%s", error.text);
+            tl_mesh_destroy(mesh);
+        }
+        /* the encoder may turn a triangle's corners, so sums round differently */
+        assert_true(fabs(read[0].max_error - read[1].max_error) < 1e-9);
+        assert_true(fabs(read[0].rms_error - read[1].rms_error) < 1e-9);
+        assert_int_equal(read[1].samples, read[0].samples);
+        assert_int_equal(read[0].samples, own.samples);
+        assert_true(read[0].max_error != own.max_error); /* they are steps */
+        tl_write_options options = {.frame = frames[round & 1], .coding = TL_CODING_QUANTIZED};
+        tl_rounding rounding = tl_write_rounding(&source->info, path, &options);
+        float low = INFINITY, high = -INFINITY;
+        for (int k = 0; k < of.width * of.height; k++) {
+            low = fminf(low, of.z[k]);
+            high = fmaxf(high, of.z[k]);
+        }
+        double range = (double)high - (double)low, most = rounding.upright + rounding.of_range * range +
+                                                          rounding.along * range * 1.5; /* no steeper than that */
+        assert_true(fabs(read[0].max_error - own.max_error) <= most);
+        assert_true((rounding.along > 0) == (options.frame == TL_FRAME_PROJECTED));
+        tl_source_destroy(source);
+        assert_int_equal(unlink(path), 0);
+        free(of.z);
+    }
+}
+
 static size_t load(const char *path, unsigned char **bytes)
 {
     FILE *file = fopen(path, "rb");
@@ -187,12 +236,13 @@ static void store(const char *path, const unsigned char *bytes, size_t count)
 static void damagedFilesAreRefusedOrRead(void **state)
 {
     (void)state;
-    for (int kind = 0; kind < 4; kind++) {
+    for (int kind = 0; kind < 6; kind++) {
         grid of;
         random_state = (uint64_t)kind;
         tl_source *source = open_hills(&of, false);
-        const char *path = path_of(endings[kind]);
-        tl_mesh_destroy(write_mesh(source, 8, path, TL_FRAME_PROJECTED));
+        const char *path = path_of(kind < 4 ? endings[kind] : "glb");
+        tl_mesh_coding coding = kind < 4 ? TL_CODING_PLAIN : kind == 4 ? TL_CODING_QUANTIZED : TL_CODING_COMPRESSED;
+        tl_mesh_destroy(write_coded(source, 8, path, TL_FRAME_PROJECTED, coding));
         unsigned char *bytes;
         size_t count = load(path, &bytes), refused = 0;
         for (int round = 0; round < 600; round++) {
@@ -224,9 +274,8 @@ static void damagedFilesAreRefusedOrRead(void **state)
 int main(void)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(filesAreAsFarFromTheDemAsTheirMeshes),
-        cmocka_unit_test(filesTellWhatMemoryDoesNot),
-        cmocka_unit_test(samplesAreHeldToTheirOwnBounds),
+        cmocka_unit_test(filesAreAsFarFromTheDemAsTheirMeshes), cmocka_unit_test(filesTellWhatMemoryDoesNot),
+        cmocka_unit_test(samplesAreHeldToTheirOwnBounds),       cmocka_unit_test(stepsAddWhatIsSaid),
         cmocka_unit_test(damagedFilesAreRefusedOrRead),
     };
     return cmocka_run_group_tests(tests, make_folder, remove_folder);

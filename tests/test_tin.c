@@ -431,7 +431,7 @@ static void check_ground(const ground *of, tl_mesh_kind kind, double max_error)
     snprintf(path, sizeof path, "test_tin_%ld.ply", (long)getpid());
     tl_simplify_options options = {
         .max_error = max_error, .frame = TL_FRAME_ENU, .kind = kind, .canonical_borders = true};
-    options.rounding = tl_write_rounding(&info, path, TL_FRAME_ENU);
+    options.rounding = tl_write_rounding(&info, path, &(tl_write_options){.frame = TL_FRAME_ENU});
     made result = simplify_source(source, &options);
     tl_mesh_report report = {0};
     assert_int_equal(tl_mesh_verify_in(result.mesh, source, TL_FRAME_ENU, NULL, &report, NULL), TL_OK);

@@ -1,5 +1,7 @@
 /* glTF 2.0 binary (GLB): one mesh with positions and normals, in meshoptimizer's order for the vertex cache and fetch.
- */
+ * Plain, it has floats. Quantised (KHR_mesh_quantization), positions are 16-bit steps from the mesh's lowest corner, by
+ * a scale and a translation of the node, an axis each: heights have finer steps than the ground. Compressed, these are
+ * encoded by meshoptimizer (EXT_meshopt_compression), losslessly. */
 #include "lib/base/error.h"
 #include "lib/base/parallel.h"
 #include "lib/base/size.h"
@@ -12,10 +14,12 @@
 #include <math.h>
 #include <string.h>
 
-enum { BATCH = 1024, GLB_MAGIC = 0x46546c67, CHUNK_JSON = 0x4e4f534a, CHUNK_BINARY = 0x004e4942 };
+enum { BATCH = 1024, STEPS = 65535, GLB_MAGIC = 0x46546c67, CHUNK_JSON = 0x4e4f534a, CHUNK_BINARY = 0x004e4942 };
 enum {
     ARRAY_BUFFER = 34962,
     ELEMENT_ARRAY_BUFFER = 34963,
+    COMPONENT_I16 = 5122,
+    COMPONENT_U16 = 5123,
     COMPONENT_U32 = 5125,
     COMPONENT_FLOAT = 5126,
     MODE_TRIANGLES = 4
@@ -25,7 +29,29 @@ typedef struct vertex {
     float position[3], normal[3];
 } vertex;
 
+/* The same in 16 bits; what is left over fills words up. */
+typedef struct packed {
+    uint16_t position[3], none;
+    int16_t normal[3], nothing;
+} packed;
+
+/* A part of the binary chunk: items of one kind, encoded or not. */
+typedef struct view {
+    unsigned char *bytes;
+    size_t size;          /* of the bytes */
+    size_t count, stride; /* of the items, decoded */
+    const char *mode;     /* of EXT_meshopt_compression */
+    int target;
+} view;
+
+enum { VIEWS = 3 };
+
 typedef struct model {
+    tl_mesh_coding coding;
+    bool level_steps; /* horizontal steps are 1: those of the lattice */
+    double step[3];   /* of quantised positions */
+    view views[VIEWS];
+    int view_count;
     vertex *vertices;
     size_t vertex_count;
     uint32_t *indices;
@@ -138,11 +164,136 @@ static tl_status build(const tl_mesh *mesh, out_frame *frame, model *m, const ch
     return status;
 }
 
+/* ---- Parts of the binary chunk ---- */
+
+static view *add_view(model *m, size_t count, size_t stride, int target, const char *mode)
+{
+    view *v = &m->views[m->view_count++];
+    *v = (view){.count = count, .stride = stride, .size = count * stride, .target = target, .mode = mode};
+    v->bytes = tl_alloc((v->size + 3) / 4, 4);
+    if (v->bytes)
+        memset(v->bytes + v->size, 0, (4 - v->size % 4) % 4);
+    return v->bytes ? v : NULL;
+}
+
+static bool small_indices(const model *m)
+{
+    return m->vertex_count < STEPS; /* the largest of 16 bits restarts a primitive */
+}
+
+static bool add_indices(model *m)
+{
+    bool small = small_indices(m);
+    view *v =
+        add_view(m, m->index_count, small ? sizeof(uint16_t) : sizeof *m->indices, ELEMENT_ARRAY_BUFFER, "TRIANGLES");
+    for (size_t k = 0; v && small && k < m->index_count; k++) {
+        uint16_t index = (uint16_t)m->indices[k];
+        memcpy(v->bytes + k * sizeof index, &index, sizeof index);
+    }
+    if (v && !small)
+        memcpy(v->bytes, m->indices, v->size);
+    return v;
+}
+
+/* The steps between positions. */
+static void choose_steps(model *m)
+{
+    for (int a = 0; a < 3; a++) {
+        double range = (double)m->high[a] - (double)m->low[a];
+        bool whole = m->level_steps && a != 1 && range <= STEPS;
+        m->step[a] = whole || !(range > 0) ? 1 : range / STEPS;
+    }
+}
+
+/* Positions and normals apart, as they are encoded best. A reader turns normals by the inverse of the node's scale, so
+ * that is put in before. */
+static bool add_packed(model *m)
+{
+    view *positions = add_view(m, m->vertex_count, 8, ARRAY_BUFFER, "ATTRIBUTES");
+    view *normals = positions ? add_view(m, m->vertex_count, 8, ARRAY_BUFFER, "ATTRIBUTES") : NULL;
+    for (size_t k = 0; normals && k < m->vertex_count; k++) {
+        const vertex *from = &m->vertices[k];
+        packed to = {{0}, 0, {0}, 0};
+        double n[3], longest = 0;
+        for (int a = 0; a < 3; a++) {
+            to.position[a] = (uint16_t)lrint(((double)from->position[a] - (double)m->low[a]) / m->step[a]);
+            n[a] = (double)from->normal[a] * m->step[a];
+            longest += n[a] * n[a];
+        }
+        longest = sqrt(longest);
+        for (int a = 0; a < 3; a++)
+            to.normal[a] = (int16_t)lrint(longest > 0 ? 32767 * n[a] / longest : a == 1 ? 32767 : 0);
+        memcpy(positions->bytes + 8 * k, to.position, 8);
+        memcpy(normals->bytes + 8 * k, to.normal, 8);
+    }
+    return normals;
+}
+
+/* Replaces a part's bytes by encoded ones. */
+static bool encode(view *v, size_t vertex_count)
+{
+    bool triangles = v->target == ELEMENT_ARRAY_BUFFER;
+    size_t room = triangles ? meshopt_encodeIndexBufferBound(v->count, vertex_count)
+                            : meshopt_encodeVertexBufferBound(v->count, v->stride);
+    unsigned char *bytes = tl_alloc((room + 3) / 4, 4);
+    if (!bytes)
+        return false;
+    if (!triangles)
+        v->size = meshopt_encodeVertexBuffer(bytes, room, v->bytes, v->count, v->stride);
+    else if (v->stride == sizeof(uint16_t)) {
+        uint32_t *wide = tl_alloc(v->count, sizeof *wide);
+        for (size_t k = 0; wide && k < v->count; k++) {
+            uint16_t index;
+            memcpy(&index, v->bytes + 2 * k, sizeof index);
+            wide[k] = index;
+        }
+        v->size = wide ? meshopt_encodeIndexBuffer(bytes, room, wide, v->count) : 0;
+        free(wide);
+    } else
+        v->size = meshopt_encodeIndexBuffer(bytes, room, (const uint32_t *)(void *)v->bytes, v->count);
+    free(v->bytes);
+    v->bytes = bytes;
+    memset(bytes + v->size, 0, (4 - v->size % 4) % 4);
+    return v->size > 0;
+}
+
+static tl_status make_views(model *m, const char *path, tl_error *error)
+{
+    bool good = true;
+    if (m->coding == TL_CODING_PLAIN) {
+        view *v = add_view(m, m->vertex_count, sizeof *m->vertices, ARRAY_BUFFER, NULL);
+        good = v;
+        if (v)
+            memcpy(v->bytes, m->vertices, v->size);
+    } else {
+        choose_steps(m);
+        good = add_packed(m);
+    }
+    free(m->vertices); /* the largest of all, and done with */
+    m->vertices = NULL;
+    good = good && add_indices(m);
+    if (m->coding == TL_CODING_COMPRESSED) {
+        meshopt_encodeVertexVersion(0); /* those of the extension */
+        meshopt_encodeIndexVersion(1);
+        for (int k = 0; k < m->view_count; k++)
+            good = good && encode(&m->views[k], m->vertex_count);
+    }
+    return good ? TL_OK : tl_fail_memory(error, path);
+}
+
+static void free_model(model *m)
+{
+    for (int k = 0; k < m->view_count; k++)
+        free(m->views[k].bytes);
+    free(m->vertices);
+    free(m->indices);
+}
+
 /* ---- JSON ---- */
 
-static json_t *triple(const float v[3])
+static json_t *triple(const double v[3])
 {
-    return json_pack("[f,f,f]", (double)v[0], (double)v[1], (double)v[2]);
+    return json_pack("[f,f,f]", v[0], v[1], v[2]);
 }
 
 static json_t *extras(const tl_mesh *mesh, const out_frame *frame)
@@ -164,44 +315,119 @@ static json_t *extras(const tl_mesh *mesh, const out_frame *frame)
     return object;
 }
 
-static json_t *accessor(int view, size_t offset, int component, size_t count, const char *type)
+static json_t *accessor(int part, size_t offset, int component, size_t count, const char *type)
 {
-    return json_pack("{s:i, s:I, s:i, s:I, s:s}", "bufferView", view, "byteOffset", (json_int_t)offset, "componentType",
+    return json_pack("{s:i, s:I, s:i, s:I, s:s}", "bufferView", part, "byteOffset", (json_int_t)offset, "componentType",
                      component, "count", (json_int_t)count, "type", type);
 }
 
-static json_t *geometry(const model *m)
+/* The least and the greatest position, as they are stored. */
+static void add_bounds(const model *m, json_t *position)
 {
-    size_t vertex_bytes = m->vertex_count * sizeof(vertex), index_bytes = m->index_count * sizeof(uint32_t);
-    json_t *position = accessor(0, 0, COMPONENT_FLOAT, m->vertex_count, "VEC3");
-    json_object_set_new(position, "min", triple(m->low));
-    json_object_set_new(position, "max", triple(m->high));
-    return json_pack("{s:[o,o,o], s:[{s:i,s:I,s:I,s:i,s:i},{s:i,s:I,s:I,s:i}], s:[{s:I}]}", "accessors", position,
-                     accessor(0, 12, COMPONENT_FLOAT, m->vertex_count, "VEC3"),
-                     accessor(1, 0, COMPONENT_U32, m->index_count, "SCALAR"), "bufferViews", "buffer", 0, "byteOffset",
-                     (json_int_t)0, "byteLength", (json_int_t)vertex_bytes, "byteStride", (int)sizeof(vertex), "target",
-                     ARRAY_BUFFER, "buffer", 0, "byteOffset", (json_int_t)vertex_bytes, "byteLength",
-                     (json_int_t)index_bytes, "target", ELEMENT_ARRAY_BUFFER, "buffers", "byteLength",
-                     (json_int_t)(vertex_bytes + index_bytes));
+    double low[3] = {0}, high[3];
+    for (int a = 0; a < 3; a++) {
+        low[a] = (double)m->low[a], high[a] = (double)m->high[a];
+        if (m->coding != TL_CODING_PLAIN) {
+            high[a] = (double)lrint((high[a] - low[a]) / m->step[a]);
+            low[a] = 0;
+        }
+    }
+    bool whole = m->coding != TL_CODING_PLAIN;
+    json_object_set_new(position, "min", whole ? json_pack("[i,i,i]", 0, 0, 0) : triple(low));
+    json_object_set_new(position, "max",
+                        whole ? json_pack("[i,i,i]", (int)high[0], (int)high[1], (int)high[2]) : triple(high));
+}
+
+static json_t *accessors(const model *m)
+{
+    bool plain = m->coding == TL_CODING_PLAIN;
+    json_t *position = accessor(0, 0, plain ? COMPONENT_FLOAT : COMPONENT_U16, m->vertex_count, "VEC3");
+    json_t *normal =
+        accessor(plain ? 0 : 1, plain ? 12 : 0, plain ? COMPONENT_FLOAT : COMPONENT_I16, m->vertex_count, "VEC3");
+    add_bounds(m, position);
+    if (!plain)
+        json_object_set_new(normal, "normalized", json_true());
+    int component = small_indices(m) ? COMPONENT_U16 : COMPONENT_U32;
+    return json_pack("[o,o,o]", position, normal, accessor(m->view_count - 1, 0, component, m->index_count, "SCALAR"));
+}
+
+static size_t padded(size_t bytes)
+{
+    return (bytes + 3) / 4 * 4;
+}
+
+/* Buffer 0 is the file's own chunk. What is encoded there stands, decoded, in a buffer 1 that is nowhere. */
+static json_t *buffer_views(const model *m, size_t *stored, size_t *decoded)
+{
+    json_t *list = json_array();
+    *stored = *decoded = 0;
+    for (int k = 0; k < m->view_count; k++) {
+        const view *v = &m->views[k];
+        bool encoded = m->coding == TL_CODING_COMPRESSED, vertices = v->target == ARRAY_BUFFER;
+        size_t bytes = v->count * v->stride;
+        json_t *item =
+            json_pack("{s:i,s:I,s:I,s:i}", "buffer", encoded ? 1 : 0, "byteOffset",
+                      (json_int_t)(encoded ? *decoded : *stored), "byteLength", (json_int_t)bytes, "target", v->target);
+        if (vertices)
+            json_object_set_new(item, "byteStride", json_integer((json_int_t)v->stride));
+        if (encoded)
+            json_object_set_new(item, "extensions",
+                                json_pack("{s:{s:i,s:I,s:I,s:I,s:I,s:s}}", "EXT_meshopt_compression", "buffer", 0,
+                                          "byteOffset", (json_int_t)*stored, "byteLength", (json_int_t)v->size,
+                                          "byteStride", (json_int_t)v->stride, "count", (json_int_t)v->count, "mode",
+                                          v->mode));
+        json_array_append_new(list, item);
+        *stored += padded(v->size);
+        *decoded += padded(bytes);
+    }
+    return list;
+}
+
+static void add_geometry(const model *m, json_t *root)
+{
+    size_t stored, decoded;
+    json_object_set_new(root, "accessors", accessors(m));
+    json_object_set_new(root, "bufferViews", buffer_views(m, &stored, &decoded));
+    json_t *buffers = json_pack("[{s:I}]", "byteLength", (json_int_t)stored);
+    if (m->coding == TL_CODING_COMPRESSED)
+        json_array_append_new(buffers, json_pack("{s:I,s:{s:{s:b}}}", "byteLength", (json_int_t)decoded, "extensions",
+                                                 "EXT_meshopt_compression", "fallback", 1));
+    json_object_set_new(root, "buffers", buffers);
+    if (m->coding == TL_CODING_PLAIN)
+        return;
+    json_t *used = json_pack("[s]", "KHR_mesh_quantization");
+    if (m->coding == TL_CODING_COMPRESSED)
+        json_array_append_new(used, json_string("EXT_meshopt_compression"));
+    json_object_set_new(root, "extensionsUsed", used);
+    json_object_set_new(root, "extensionsRequired", json_copy(used));
+}
+
+static json_t *describe_node(const model *m)
+{
+    json_t *node = json_pack("{s:i, s:s}", "mesh", 0, "name", "terrain");
+    double at[3];
+    bool plain = m->coding == TL_CODING_PLAIN;
+    for (int a = 0; a < 3; a++)
+        at[a] = m->origin[a] + (plain ? 0 : (double)m->low[a]);
+    if (at[0] != 0 || at[1] != 0 || at[2] != 0)
+        json_object_set_new(node, "translation", triple(at));
+    if (!plain)
+        json_object_set_new(node, "scale", triple(m->step));
+    return node;
 }
 
 static char *describe(const tl_mesh *mesh, const out_frame *frame, const model *m)
 {
-    json_t *node = json_pack("{s:i, s:s}", "mesh", 0, "name", "terrain");
-    if (m->origin[0] != 0 || m->origin[1] != 0 || m->origin[2] != 0)
-        json_object_set_new(node, "translation", json_pack("[f,f,f]", m->origin[0], m->origin[1], m->origin[2]));
     json_t *root =
         json_pack("{s:{s:s, s:s, s:o}, s:i, s:[{s:[i]}], s:[o], s:[{s:[{s:{s:i,s:i}, s:i, s:i, s:i}]}], "
                   "s:[{s:{s:[f,f,f,f], s:f, s:f}}]}",
                   "asset", "version", "2.0", "generator", "talus", "extras", extras(mesh, frame), "scene", 0, "scenes",
-                  "nodes", 0, "nodes", node, "meshes", "primitives", "attributes", "POSITION", 0, "NORMAL", 1,
-                  "indices", 2, "mode", MODE_TRIANGLES, "material", 0, "materials", "pbrMetallicRoughness",
+                  "nodes", 0, "nodes", describe_node(m), "meshes", "primitives", "attributes", "POSITION", 0, "NORMAL",
+                  1, "indices", 2, "mode", MODE_TRIANGLES, "material", 0, "materials", "pbrMetallicRoughness",
                   "baseColorFactor", 0.55, 0.52, 0.46, 1.0, "metallicFactor", 0.0, "roughnessFactor", 1.0);
-    json_t *arrays = m->index_count ? geometry(m) : NULL;
-    char *text = NULL;
-    if (root && arrays && json_object_update(root, arrays) == 0)
-        text = json_dumps(root, JSON_COMPACT | JSON_REAL_PRECISION(17));
-    json_decref(arrays);
+    if (root)
+        add_geometry(m, root);
+    char *text = root ? json_dumps(root, JSON_COMPACT | JSON_REAL_PRECISION(17)) : NULL;
     json_decref(root);
     return text;
 }
@@ -213,27 +439,35 @@ static tl_status write_words(tl_output *output, const uint32_t *words, size_t co
     return tl_output_append(output, words, count * sizeof *words, error);
 }
 
+static tl_status too_large(const char *path, size_t triangles, tl_error *error)
+{
+    return tl_fail(error, TL_ERROR_ARGUMENT,
+                   "%s: %zu triangles need more than the 4 GiB of a GLB; refine by fewer levels, cut it in parts, or "
+                   "use .ply",
+                   path, triangles);
+}
+
 static tl_status write_file(const model *m, const char *json, tl_output *output, tl_error *error)
 {
-    size_t text = strlen(json), padded = (text + 3) / 4 * 4;
-    uint64_t binary = (uint64_t)m->vertex_count * sizeof(vertex) + (uint64_t)m->index_count * sizeof(uint32_t);
-    uint64_t whole = 12 + 8 + padded + 8 + binary;
+    size_t text = strlen(json), room = padded(text);
+    uint64_t binary = 0;
+    for (int k = 0; k < m->view_count; k++)
+        binary += padded(m->views[k].size);
+    uint64_t whole = 12 + 8 + room + 8 + binary;
     if (whole > UINT32_MAX)
-        return tl_fail(error, TL_ERROR_ARGUMENT,
-                       "%s: %zu triangles need more than the 4 GiB of a GLB; refine by fewer levels or use .ply",
-                       tl_output_path(output), m->index_count / 3);
-    const uint32_t head[5] = {GLB_MAGIC, 2, (uint32_t)whole, (uint32_t)padded, CHUNK_JSON};
+        return too_large(tl_output_path(output), m->index_count / 3, error);
+    const uint32_t head[5] = {GLB_MAGIC, 2, (uint32_t)whole, (uint32_t)room, CHUNK_JSON};
     const uint32_t binary_head[2] = {(uint32_t)binary, CHUNK_BINARY};
     tl_status status = write_words(output, head, 5, error);
     if (status == TL_OK)
         status = tl_output_append(output, json, text, error);
     if (status == TL_OK)
-        status = tl_output_append(output, "   ", padded - text, error);
+        status = tl_output_append(output, "   ", room - text, error);
     if (status == TL_OK)
         status = write_words(output, binary_head, 2, error);
-    if (status == TL_OK)
-        status = tl_output_append(output, m->vertices, m->vertex_count * sizeof *m->vertices, error);
-    return status == TL_OK ? write_words(output, m->indices, m->index_count, error) : status;
+    for (int k = 0; status == TL_OK && k < m->view_count; k++)
+        status = tl_output_append(output, m->views[k].bytes, padded(m->views[k].size), error);
+    return status;
 }
 
 tl_status out_gltf_write(const tl_mesh *mesh, tl_output *output, const tl_write_options *options, tl_error *error)
@@ -241,24 +475,26 @@ tl_status out_gltf_write(const tl_mesh *mesh, tl_output *output, const tl_write_
     const char *path = tl_output_path(output);
     if (!mesh->triangle_count)
         return tl_fail(error, TL_ERROR_DATA, "%s: there is no triangle to write, and glTF has no empty meshes", path);
-    if ((double)mesh->vertex_count * sizeof(vertex) + (double)mesh->triangle_count * 12 > UINT32_MAX)
-        return tl_fail(error, TL_ERROR_ARGUMENT,
-                       "%s: %zu triangles need more than the 4 GiB of a GLB; refine by fewer levels or use .ply", path,
-                       mesh->triangle_count);
+    double least =
+        options->coding == TL_CODING_PLAIN ? sizeof(vertex) : sizeof(packed); /* bytes a vertex, not encoded */
+    if (options->coding != TL_CODING_COMPRESSED &&
+        (double)mesh->vertex_count * least + (double)mesh->triangle_count * 6 > UINT32_MAX)
+        return too_large(path, mesh->triangle_count, error);
     tl_status status = tl_run_check(options->run, error);
     out_frame *frame = status == TL_OK ? out_frame_create(mesh, options->frame, path, error) : NULL;
     if (!frame)
         return status == TL_OK ? TL_ERROR_DATA : status;
-    model m = {0};
+    model m = {.coding = options->coding, .level_steps = out_frame_kind(frame) == TL_FRAME_PIXEL};
     status = first_position(mesh, frame, m.origin, error);
     if (status == TL_OK)
         status = build(mesh, frame, &m, path, error);
+    if (status == TL_OK)
+        status = make_views(&m, path, error);
     char *json = status == TL_OK ? describe(mesh, frame, &m) : NULL;
     if (status == TL_OK)
         status = json ? write_file(&m, json, output, error) : tl_fail_memory(error, path);
     free(json);
-    free(m.vertices);
-    free(m.indices);
+    free_model(&m);
     out_frame_destroy(frame);
     return status;
 }

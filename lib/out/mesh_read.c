@@ -4,6 +4,7 @@
 #include "lib/base/size.h"
 
 #include <jansson.h>
+#include <meshoptimizer.h>
 
 #include <errno.h>
 #include <math.h>
@@ -14,6 +15,7 @@ enum {
     GLB_MAGIC = 0x46546c67,
     CHUNK_JSON = 0x4e4f534a,
     CHUNK_BINARY = 0x004e4942,
+    COMPONENT_U16 = 5123,
     COMPONENT_U32 = 5125,
     COMPONENT_FLOAT = 5126
 };
@@ -233,47 +235,117 @@ static size_t size_of(json_t *object, const char *name)
     return value > 0 ? (size_t)value : 0;
 }
 
-/* Where an accessor's items lie: `stride` from one to the next, the last of them within the binary chunk. */
-static const unsigned char *find_items(json_t *root, size_t index, int component, size_t size, const bytes *binary,
-                                       size_t *count, size_t *stride)
+/* What an accessor names. */
+typedef struct items {
+    const unsigned char *at;
+    size_t count, stride;
+    int component;
+    unsigned char *decoded; /* what `at` points into, where it was encoded; to be freed */
+} items;
+
+/* The most that meshoptimizer's codecs make of a byte: a header byte of a vertices' block stands for 16 zero deltas
+ * of four bytes' groups, a byte of the triangles' codes for a triangle. */
+enum { MOST_OF_A_BYTE = 256 };
+
+/* A part that EXT_meshopt_compression encoded, as `count` items of `stride` bytes. */
+static unsigned char *decode_view(json_t *how, const bytes *binary, size_t *size)
+{
+    size_t start = size_of(how, "byteOffset"), length = size_of(how, "byteLength");
+    size_t count = size_of(how, "count"), stride = size_of(how, "byteStride");
+    const char *mode = json_string_value(json_object_get(how, "mode"));
+    if (!mode || start > binary->count || length > binary->count - start || !tl_size_mul(count, stride, size) ||
+        *size / MOST_OF_A_BYTE > length)
+        return NULL;
+    bool vertices = strcmp(mode, "ATTRIBUTES") == 0 && stride % 4 == 0 && stride > 0 && stride <= 256;
+    bool triangles = strcmp(mode, "TRIANGLES") == 0 && (stride == 2 || stride == 4) && count % 3 == 0;
+    unsigned char *out = vertices || triangles ? tl_alloc(*size / 4 + 1, 4) : NULL;
+    int failed = -1;
+    if (out && vertices)
+        failed = meshopt_decodeVertexBuffer(out, count, stride, binary->all + start, length);
+    else if (out)
+        failed = meshopt_decodeIndexBuffer(out, count, stride, binary->all + start, length);
+    if (failed) {
+        free(out);
+        return NULL;
+    }
+    return out;
+}
+
+/* Where an accessor's items of `parts` numbers lie, which may be floats or whole: `stride` from one to the next, the
+ * last of them within the part. False: not so. */
+static bool find_items(json_t *root, size_t index, size_t parts, const bytes *binary, items *out)
 {
     json_t *accessor = item_of(root, "accessors", index);
     json_t *view = item_of(root, "bufferViews", size_of(accessor, "bufferView"));
-    size_t start = size_of(view, "byteOffset"), offset = size_of(accessor, "byteOffset"), span;
-    *count = size_of(accessor, "count");
-    *stride = json_object_get(view, "byteStride") ? size_of(view, "byteStride") : size;
-    if (!accessor || !view || (int)size_of(accessor, "componentType") != component || *stride < size || !*count)
-        return NULL;
-    if (!tl_size_mul(*count - 1, *stride, &span) || start > binary->count || offset > binary->count - start ||
-        span > binary->count - start - offset || size > binary->count - start - offset - span)
-        return NULL;
-    return binary->all + start + offset;
+    json_t *how = json_object_get(json_object_get(view, "extensions"), "EXT_meshopt_compression");
+    size_t start = size_of(view, "byteOffset"), offset = size_of(accessor, "byteOffset"), span, room = binary->count;
+    const unsigned char *base = binary->all;
+    *out = (items){.count = size_of(accessor, "count"), .component = (int)size_of(accessor, "componentType")};
+    size_t size = parts * (out->component == COMPONENT_U16 ? 2 : 4);
+    out->stride = json_object_get(view, "byteStride") ? size_of(view, "byteStride") : size;
+    if (!accessor || !view || out->stride < size || !out->count)
+        return false;
+    if (how) {
+        base = out->decoded = decode_view(how, binary, &room);
+        start = 0;
+        if (!base)
+            return false;
+    }
+    if (!tl_size_mul(out->count - 1, out->stride, &span) || start > room || offset > room - start ||
+        span > room - start - offset || size > room - start - offset - span)
+        return false;
+    out->at = base + start + offset;
+    return true;
+}
+
+static uint32_t half_word_at(const unsigned char *from)
+{
+    return (uint32_t)from[0] | (uint32_t)from[1] << 8;
+}
+
+/* Of positions and indices that were found. */
+static tl_status take_items(json_t *node, const bytes *binary, const items *at, const items *index, out_mesh_file *out,
+                            tl_error *error)
+{
+    json_t *translation = json_object_get(node, "translation"), *scale = json_object_get(node, "scale");
+    double factor[3];
+    out->vertex_count = at->count;
+    out->triangle_count = index->count / 3;
+    if (!make_room(out))
+        return tl_fail_memory(error, binary->path);
+    for (size_t a = 0; a < 3; a++)
+        factor[a] = scale ? json_number_value(json_array_get(scale, a)) : 1;
+    for (size_t k = 0; k < out->vertex_count; k++) {
+        const unsigned char *from = at->at + k * at->stride;
+        double y_up[3];
+        for (size_t a = 0; a < 3; a++) {
+            double value = at->component == COMPONENT_U16 ? half_word_at(from + 2 * a) : float_at(from + 4 * a);
+            y_up[a] = value * factor[a] + json_number_value(json_array_get(translation, a));
+        }
+        out->xyz[k][0] = y_up[0], out->xyz[k][1] = -y_up[2], out->xyz[k][2] = y_up[1];
+    }
+    for (size_t k = 0; k < index->count; k++) {
+        const unsigned char *from = index->at + k * index->stride;
+        out->indices[k] = index->component == COMPONENT_U16 ? half_word_at(from) : word_at(from);
+    }
+    return TL_OK;
 }
 
 static tl_status take_glb(json_t *root, const bytes *binary, out_mesh_file *out, tl_error *error)
 {
     json_t *node = item_of(root, "nodes", 0), *mesh = item_of(root, "meshes", size_of(node, "mesh"));
     json_t *primitive = item_of(mesh, "primitives", 0), *attributes = json_object_get(primitive, "attributes");
-    json_t *translation = json_object_get(node, "translation");
-    size_t stride, corners, index_stride;
-    const unsigned char *at =
-        find_items(root, size_of(attributes, "POSITION"), COMPONENT_FLOAT, 12, binary, &out->vertex_count, &stride);
-    const unsigned char *index =
-        find_items(root, size_of(primitive, "indices"), COMPONENT_U32, 4, binary, &corners, &index_stride);
-    if (!at || !index || corners % 3 || !json_object_get(attributes, "POSITION"))
-        return malformed(binary, "its accessors", error);
-    out->triangle_count = corners / 3;
-    if (!make_room(out))
-        return tl_fail_memory(error, binary->path);
-    for (size_t k = 0; k < out->vertex_count; k++, at += stride) {
-        double y_up[3];
-        for (int a = 0; a < 3; a++)
-            y_up[a] = float_at(at + 4 * a) + json_number_value(json_array_get(translation, (size_t)a));
-        out->xyz[k][0] = y_up[0], out->xyz[k][1] = -y_up[2], out->xyz[k][2] = y_up[1];
-    }
-    for (size_t k = 0; k < corners; k++)
-        out->indices[k] = word_at(index + k * index_stride);
-    return TL_OK;
+    items at = {0}, index = {0};
+    bool good = json_object_get(attributes, "POSITION") &&
+                find_items(root, size_of(attributes, "POSITION"), 3, binary, &at) &&
+                (at.component == COMPONENT_FLOAT || at.component == COMPONENT_U16) &&
+                find_items(root, size_of(primitive, "indices"), 1, binary, &index) &&
+                (index.component == COMPONENT_U32 || index.component == COMPONENT_U16) && index.count % 3 == 0;
+    tl_status status =
+        good ? take_items(node, binary, &at, &index, out, error) : malformed(binary, "its accessors", error);
+    free(at.decoded);
+    free(index.decoded);
+    return status;
 }
 
 static tl_status read_glb(bytes *in, out_mesh_file *out, tl_error *error)

@@ -39,15 +39,45 @@ static tl_rounding on_map(const tl_source_info *grid, bool text)
     return (tl_rounding){.along = off / cell};
 }
 
-tl_rounding tl_write_rounding(const tl_source_info *grid, const char *path, tl_frame frame)
+/* Coordinates of 16 bits add half a step in each direction: of what the raster takes at most, and a hundredth for what
+ * steps and their ends round. */
+static void add_steps(const tl_source_info *grid, tl_frame frame, tl_rounding *to)
 {
-    bool text = is_ending(path, "obj"), placed = grid->georef.crs && grid->georef.located;
-    if (frame == TL_FRAME_ENU || (frame == TL_FRAME_DEFAULT && placed))
-        return in_space(grid, text);
-    if (frame == TL_FRAME_PIXEL || is_ending(path, "ply"))
-        return (tl_rounding){0};
-    tl_rounding map = on_map(grid, text);
-    if (is_ending(path, "glb"))
-        map.of_range = SINGLE; /* heights count from that of the first vertex */
-    return map;
+    const double half = 0.505 / 65535;
+    const tl_georef *georef = &grid->georef;
+    const double *t = georef->transform;
+    double width = (double)grid->width, height = (double)grid->height, cell = 1;
+    double x = width, y = height; /* extents, in the unit that `cell` is in */
+    to->of_range += half;
+    if (frame == TL_FRAME_PIXEL && fmax(width, height) <= 65535)
+        return; /* steps of one sample */
+    if (frame == TL_FRAME_PROJECTED) {
+        x = fabs(t[1]) * width + fabs(t[2]) * height, y = fabs(t[4]) * width + fabs(t[5]) * height;
+        cell = fabs(t[1] * t[5] - t[2] * t[4]) / fmax(hypot(t[1], t[4]), hypot(t[2], t[5]));
+    } else if (frame == TL_FRAME_ENU) {
+        double reach = 0.75 * (width * georef->cell_x + height * georef->cell_y);
+        double radius = georef->crs && georef->crs->semi_major > 0 ? georef->crs->semi_major : 6.378e6;
+        x = y = 2 * reach;
+        cell = fmin(georef->cell_x, georef->cell_y);
+        to->upright += half * reach * reach / (2 * radius) / georef->height_unit;
+    }
+    to->along += half * hypot(x, y) / cell;
+}
+
+tl_rounding tl_write_rounding(const tl_source_info *grid, const char *path, const tl_write_options *options)
+{
+    bool text = is_ending(path, "obj"), glb = is_ending(path, "glb");
+    tl_frame frame = options->frame;
+    if (frame == TL_FRAME_DEFAULT)
+        frame = grid->georef.crs && grid->georef.located ? TL_FRAME_ENU : TL_FRAME_PROJECTED;
+    tl_rounding rounding = {0};
+    if (frame == TL_FRAME_ENU)
+        rounding = in_space(grid, text);
+    else if (frame == TL_FRAME_PROJECTED && !is_ending(path, "ply"))
+        rounding = on_map(grid, text);
+    if (glb && frame == TL_FRAME_PROJECTED)
+        rounding.of_range = SINGLE; /* heights count from that of the first vertex */
+    if (glb && options->coding != TL_CODING_PLAIN)
+        add_steps(grid, frame, &rounding);
+    return rounding;
 }

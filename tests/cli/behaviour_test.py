@@ -764,6 +764,18 @@ def diagonals_are_turned(case):
     expect("--diagonal lower is for quadtree meshes" in refused, refused)
 
 
+def codings_keep_the_bound(case):
+    """A GLB in steps of 16 bits, encoded or not, keeps the bound by its own numbers; other formats have no coding."""
+    sizes = []
+    for coding in ("float", "quantized", "meshopt"):
+        said = case.run("simplify", EXAMPLE, "-e", 20, "--coding", coding, "--verify", "-o", f"{coding}.glb").err
+        expect(float(re.search(r"largest error ([\d.e+-]+) at", said).group(1)) <= 20, said)
+        sizes.append(os.path.getsize(case.path(f"{coding}.glb")))
+    expect(sizes[2] < sizes[0] / 2 and sizes[1] < sizes[0], f"{sizes}")
+    refused = case.run("simplify", EXAMPLE, "-e", 20, "--coding", "meshopt", "-o", "x.ply", status=2).err
+    expect("--coding is for .glb" in refused, refused)
+
+
 # ---- the manuals ----
 
 def commands_in_readme():
@@ -958,7 +970,7 @@ TESTS = [
     names_of_any_bytes,
     formats_hold_the_same_heights, png_within_half_a_step, point_samples_are_kept, point_samples_of_the_andes_are_kept,
     area_means_stay_on_their_footprint,
-    glb_is_in_metres, frames_agree, simplify_keeps_its_word, diagonals_are_turned,
+    glb_is_in_metres, frames_agree, simplify_keeps_its_word, diagonals_are_turned, codings_keep_the_bound,
     manuals_show_what_works, man_page_knows_every_option,
     memory_does_not_grow_with_the_output, memory_stays_within_what_is_given, bad_files_end_with_one_line,
     gdal_reads_the_geotiff, gdal_places_the_example, openexr_reads_the_exr, openimageio_agrees_on_the_range,
