@@ -134,7 +134,7 @@ static scene_rgb light_of(const painting *p, const scene_hit *hit, double x, dou
     if (painter->options.haze == 0)
         return colour;
     const scene_rgb air = {0.66f, 0.74f, 0.83f};
-    double distance = point.ahead * length / painter->options.haze;
+    double distance = point.at[2] * length / painter->options.haze;
     float lost = (float)(distance * distance / (1 + distance * distance));
     return scene_mix(colour, air, isnan(lost) ? 1 : lost);
 }
@@ -204,11 +204,11 @@ static void keep_depth(const painting *p, const scene_canvas *canvas, int64_t to
     for (int row = 0; row < canvas->height; row++)
         for (int column = 0; column < canvas->width; column++) {
             size_t at = (size_t)row * (size_t)canvas->width + (size_t)column;
-            scene_point point = {.ahead = (double)NAN};
+            scene_point point = {.at = {0, 0, (double)NAN}};
             if (canvas->hits[at].nearness > 0)
                 scene_stage_point(p->stage, &canvas->hits[at], canvas->left + column + 0.5, canvas->top + row + 0.5,
                                   true, &point);
-            p->depth[(size_t)top * (size_t)canvas->width + at] = (float)point.ahead;
+            p->depth[(size_t)top * (size_t)canvas->width + at] = (float)point.at[2];
         }
 }
 

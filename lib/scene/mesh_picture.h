@@ -32,13 +32,18 @@ size_t scene_stage_band_hits(const scene_stage *stage);
 typedef struct scene_point {
     double i, j;     /* on the lattice of the model */
     double height;   /* of the mesh there, not exaggerated */
-    double ahead;    /* metres */
+    double at[3];    /* right and down of the eye, in samples at 1 m ahead; metres ahead */
     float normal[3]; /* east, north, up; of length 1 */
 } scene_point;
 
 /* What a hit shows in the direction of the sample's middle. */
 void scene_stage_point(const scene_stage *stage, const scene_hit *hit, double x, double y, bool facet,
                        scene_point *out);
+
+/* Where a vertex of its mesh is, as scene_point.at. */
+const double *scene_stage_vertex(const scene_stage *stage, uint32_t vertex);
+/* From the lattice of the model to that of the mesh. */
+void scene_stage_lattice(const scene_stage *stage, double *i, double *j);
 
 /* ---- Pictures ---- */
 

@@ -314,13 +314,14 @@ void scene_stage_point(const scene_stage *s, const scene_hit *hit, double x, dou
     const double *corners[3] = {s->corners[v[0]], s->corners[v[1]], s->corners[v[2]]}, direction[3] = {x, y, 1};
     double shares[3], i = 0, j = 0, normal[3];
     shares_of(corners, direction, shares);
-    out->height = out->ahead = 0;
+    out->height = out->at[0] = out->at[1] = out->at[2] = 0;
     for (int k = 0; k < 3; k++) {
         const tl_vertex *at = &s->mesh->vertices[v[k]];
         i += shares[k] * at->i;
         j += shares[k] * at->j;
         out->height += shares[k] * (double)at->z;
-        out->ahead += shares[k] * corners[k][2];
+        for (int a = 0; a < 3; a++)
+            out->at[a] += shares[k] * corners[k][a];
     }
     model_place(s, i, j, &out->i, &out->j);
     if (facet || !s->normals)
@@ -328,4 +329,17 @@ void scene_stage_point(const scene_stage *s, const scene_hit *hit, double x, dou
     else
         mean_normal(s, v, shares, normal);
     set_normal(s, normal, out->normal);
+}
+
+const double *scene_stage_vertex(const scene_stage *stage, uint32_t vertex)
+{
+    return stage->corners[vertex];
+}
+
+void scene_stage_lattice(const scene_stage *stage, double *i, double *j)
+{
+    const double *l = stage->lattice;
+    double determinant = l[1] * l[5] - l[2] * l[4], x = *i - l[0], y = *j - l[3];
+    *i = (l[5] * x - l[2] * y) / determinant;
+    *j = (l[1] * y - l[4] * x) / determinant;
 }
