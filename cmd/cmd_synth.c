@@ -25,6 +25,7 @@ typedef struct settings {
     bool size_given, hurst_given, delta_given;
     double max_error; /* of the framework that the DEM is reduced to first */
     bool max_error_given, verify;
+    const char *hurst_map, *delta_map, *sigma_map;
 } settings;
 
 static void report(const settings *set, const tl_source *made, double seconds)
@@ -221,6 +222,44 @@ static int verify(const settings *set, const ground *of, const tl_source *field,
     return EXIT_DONE;
 }
 
+/* Opens "RASTER" or "RASTER:BAND". */
+static tl_source *open_map(const char *text, const tl_run *run, tl_error *error)
+{
+    const char *colon = strrchr(text, ':');
+    size_t length = strlen(text), digits = colon ? strspn(colon + 1, "0123456789") : 0;
+    bool band = digits > 0 && digits < 6 && colon[1 + digits] == 0;
+    char *path = malloc(length + 1);
+    if (!path) {
+        *error = (tl_error){TL_ERROR_MEMORY, "not enough memory for a name"};
+        return NULL;
+    }
+    memcpy(path, text, length + 1);
+    tl_dem_options options = {.run = run};
+    if (band) {
+        path[colon - text] = 0;
+        options.band = (unsigned)strtoul(colon + 1, NULL, 10);
+    }
+    tl_source *map = tl_open_with(path, &options, error);
+    free(path);
+    return map;
+}
+
+/* The field over a model, with the maps that are asked for; NULL on failure. */
+static tl_source *make_field(settings *set, const tl_source *dem, tl_source *maps[2], tl_error *error)
+{
+    const char *const names[2] = {set->hurst_map, set->sigma_map ? set->sigma_map : set->delta_map};
+    for (int k = 0; k < 2; k++)
+        if (names[k]) {
+            maps[k] = open_map(names[k], set->field.run, error);
+            if (!maps[k])
+                return NULL;
+        }
+    set->field.hurst_map = maps[0];
+    set->field.delta_map = maps[1];
+    set->field.delta_map_is_sigma = set->sigma_map != NULL;
+    return tl_field_create(dem, &set->field, error);
+}
+
 static int synth(settings *set, const arguments *inputs)
 {
     progress bar;
@@ -235,11 +274,13 @@ static int synth(settings *set, const arguments *inputs)
     report_framework(set, &of);
     progress_stage(&bar, "measuring");
     set->field.run = &run;
-    tl_source *field = tl_field_create(dem, &set->field, &error);
+    tl_source *maps[2] = {NULL, NULL}, *field = make_field(set, dem, maps, &error);
     int status = field ? write_out(set, field, &run, &bar) : command_failed(&bar, &error);
     if (status == EXIT_DONE && set->verify)
         status = verify(set, &of, field, &bar);
     tl_source_destroy(field);
+    tl_source_destroy(maps[0]);
+    tl_source_destroy(maps[1]);
     close_ground(&of);
     return status;
 }
@@ -289,13 +330,19 @@ static int run_synth(const command *self, int argc, const char **argv, bool help
          "standard deviation of the height difference over one DEM sample, in the DEM's unit, 0...1e30 (default: "
          "measured)",
          0, 1e30, NULL},
+        {"hurst-map", 0, OPTION_TEXT, &set.hurst_map, NULL, "RASTER[:BAND]",
+         "--hurst from place to place, as the first band of stats --maps", 0, 0, NULL},
+        {"delta-map", 0, OPTION_TEXT, &set.delta_map, NULL, "RASTER[:BAND]", "--delta from place to place", 0, 0, NULL},
+        {"sigma-map", 0, OPTION_TEXT, &set.sigma_map, NULL, "RASTER[:BAND]",
+         "--delta from place to place, told by sigma of the finest octave, as the second band of stats --maps", 0, 0,
+         NULL},
         {"max-error", 'e', OPTION_NUMBER, &set.max_error, &set.max_error_given, "E",
          "reduce the DEM to its framework first; what that drops is made again, within E of every sample, 0...1e30", 0,
          1e30, NULL},
         {"verify", 0, OPTION_FLAG, &set.verify, NULL, NULL, "with --max-error: measure the result against the DEM", 0,
          0, NULL},
         {"scheme", 0, OPTION_TEXT, &set.field.scheme, NULL, "NAME",
-         "way to refine, listed below (default: terrain; stationary with --hurst or --delta)", 0, 0, NULL},
+         "way to refine, listed below (default: terrain; stationary with --hurst, --delta or a map)", 0, 0, NULL},
         {"support", 0, OPTION_CHOICE, &set.support, NULL, "KIND",
          "what samples stand for: as the raster says, means over cells, or points (default: raster)", 0, 0, supports},
         {0}};
@@ -327,6 +374,10 @@ static int run_synth(const command *self, int argc, const char **argv, bool help
     set.field.support = (tl_support)set.support;
     bool good = (!set.field.scheme || names_scheme(set.field.scheme, false)) &&
                 command_output_ok(&set.common, true, true) && mip_ok(&set);
+    if (good && set.delta_map && set.sigma_map) {
+        complain("--delta-map and --sigma-map say the same; give one of them");
+        good = false;
+    }
     if (good && set.verify && !set.max_error_given) {
         complain("--verify measures against --max-error E; give that too");
         good = false;

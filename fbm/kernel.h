@@ -28,12 +28,35 @@ typedef struct fbm_edge_job {
     float *out;        /* count edges */
 } fbm_edge_job;
 
+/* Coefficients that change along a row (see fbm/places.h): those of vertex v are at [v * 2 * size], followed by what
+ * they grow by up to the next vertex; size is fbm_places_size / 2. The point x of a job lies in the block of vertex
+ * (first + x) >> shift, `half` a cell into its cell. */
+typedef struct fbm_place_row {
+    const float *values;
+    size_t first;
+    int shift; /* 0 ... FBM_PLACES_SHIFT */
+    bool half, square;
+} fbm_place_row;
+
 typedef struct fbm_kernel {
     const char *name; /* "avx2" */
     void (*noise)(uint64_t seed, int32_t level, fbm_noise_kind kind, int64_t row, int64_t first, size_t count,
                   float *out);
     void (*centres)(const fbm_centre_job *job, size_t count);
     void (*edges)(const fbm_edge_job *job, size_t count);
+    /* The same with coefficients by place instead of the job's own. */
+    void (*place_centres)(const fbm_centre_job *job, const fbm_place_row *row, size_t count);
+    void (*place_edges)(const fbm_edge_job *job, const fbm_place_row *row, size_t count);
+    /* See fbm/places.h; exponents are in the table's range, `nodes` weighs the aspects, roots[x] is sqrt(1 - hurst[x]).
+     */
+    void (*place_unit)(const fbm_places_table *table, const float *nodes, const float *hurst, const float *roots,
+                       size_t count, float *out);
+    void (*place_scale)(const fbm_places_table *table, const float *strengths, size_t count, const float *unit,
+                        float *out);
+    /* The values of a fbm_place_row, part of the way from those of vertices a to b. */
+    void (*place_values)(const float *a, const float *b, float part, bool square, size_t count, float *out);
+    /* out[x] = strength[x] 2^(-fall hurst[x]), to 4e-7 and what rounding fall hurst costs */
+    void (*strengths)(const float *strength, const float *hurst, float fall, float *out, size_t count);
     /* out[x] = (a[x] + b[x]) / 2 + t g[x]; g may be NULL */
     void (*mean2)(const float *a, const float *b, const float *g, float t, float *out, size_t count);
     /* the same of the 4 corners (a[x], a[x + 1], b[x], b[x + 1]) */

@@ -32,6 +32,11 @@ const fbm_scheme *fbm_scheme_find(const char *name)
     return NULL;
 }
 
+bool fbm_scheme_has_places(const fbm_scheme *scheme)
+{
+    return scheme->values == fbm_values_stationary;
+}
+
 /* floor(a / 2), for negative numbers too */
 static int64_t half(int64_t a)
 {
@@ -167,6 +172,28 @@ static const fbm_weights *weights_at(const walk *w, int64_t j, bool between)
     return step->rows ? step->rows + (2 * j + between - step->first_row) : &step->weights;
 }
 
+/* The coefficients of points in a row of input row j, from column i on, made in the places' scratch. */
+static fbm_place_row place_row(const walk *w, fbm_noise_kind kind, int64_t i, int64_t j, size_t count)
+{
+    const fbm_places *places = w->step->places;
+    const fbm_window *at = &places->window;
+    const int shift = places->shift;
+    const size_t unit = (size_t)2 << shift, all = fbm_places_size(places->square);
+    const size_t down = (size_t)(2 * (j - at->j * ((int64_t)1 << shift)) + (kind != FBM_NOISE_ROW_EDGES));
+    const size_t first = (size_t)(i - at->i * ((int64_t)1 << shift)), begin = first >> shift;
+    const size_t row = down >> (shift + 1), vertices = ((first + count - 1) >> shift) + 1 - begin;
+    const float part = (float)(down & (unit - 1)) / (float)unit;
+    const float *from = places->values + (row * at->width + begin) * all + (kind != FBM_NOISE_CENTRES ? all / 2 : 0);
+    assert(i >= at->i * ((int64_t)1 << shift) && begin + vertices <= at->width && row + (part > 0) < at->height);
+    w->kernel->place_values(from, from + (part > 0 ? at->width * all : 0), part, places->square, vertices,
+                            places->scratch);
+    return (fbm_place_row){.values = places->scratch,
+                           .first = first & ((unit / 2) - 1),
+                           .shift = shift,
+                           .half = kind != FBM_NOISE_COLUMN_EDGES,
+                           .square = places->square};
+}
+
 static void scale_taps(const walk *w, const float taps[4], float *out)
 {
     for (int k = 0; k < 4; k++)
@@ -184,10 +211,15 @@ static void stencil_centres(const walk *w, int64_t i, int64_t j, size_t count, f
     if (w->noisy)
         for (int k = 0; k < 3; k++)
             job.g[k] = ring_row(w->centre_noise, j - 1 + k);
+    memcpy(job.partial, w->partial, sizeof job.partial);
+    if (w->step->places) {
+        fbm_place_row row = place_row(w, FBM_NOISE_CENTRES, i, j, count);
+        w->kernel->place_centres(&job, &row, count);
+        return;
+    }
     const fbm_weights *weights = weights_at(w, j, true);
     memcpy(job.w, weights->centre, sizeof job.w);
     scale_taps(w, weights->centre_taps, job.t);
-    memcpy(job.partial, w->partial, sizeof job.partial);
     w->kernel->centres(&job, count);
 }
 
@@ -207,19 +239,26 @@ static void next_edge_noise(const walk *w, int64_t j)
     make_noise(w, w->column_noise, FBM_NOISE_COLUMN_EDGES, j, w->column - 1, w->count + 3);
 }
 
-static void edge_job(const walk *w, const fbm_weights *weights, fbm_edge_job *job)
+/* Makes the edges of a job whose rows are there. */
+static void make_edges(const walk *w, fbm_noise_kind kind, int64_t j, fbm_edge_job *job)
 {
-    memcpy(job->w, weights->edge, sizeof job->w);
-    scale_taps(w, weights->edge_taps, job->t);
     memcpy(job->partial, w->partial, sizeof job->partial);
     job->out = w->edge;
+    if (w->step->places) {
+        fbm_place_row row = place_row(w, kind, w->column, j, w->count);
+        w->kernel->place_edges(job, &row, w->count);
+        return;
+    }
+    const fbm_weights *weights = weights_at(w, j, kind == FBM_NOISE_COLUMN_EDGES);
+    memcpy(job->w, weights->edge, sizeof job->w);
+    scale_taps(w, weights->edge_taps, job->t);
+    w->kernel->edges(job, w->count);
 }
 
 /* Edges along row j: vertices beside them, centres above and below. */
 static void stencil_row_edges(const walk *w, int64_t j)
 {
     fbm_edge_job job = {.g = {NULL}};
-    edge_job(w, weights_at(w, j, false), &job);
     for (int k = 0; k < 3; k++) {
         job.side[k] = input(w, w->column - 1, j - 1 + k);
         if (w->noisy)
@@ -229,14 +268,13 @@ static void stencil_row_edges(const walk *w, int64_t j)
         job.same[k] = ring_row(w->centre, j - 2 + k) + 1;
     for (int k = 0; k < 2; k++)
         job.other[k] = ring_row(w->column_noise, j - 1 + k);
-    w->kernel->edges(&job, w->count);
+    make_edges(w, FBM_NOISE_ROW_EDGES, j, &job);
 }
 
 /* Edges along columns, between rows j and j + 1: centres beside them, vertices above and below. */
 static void stencil_column_edges(const walk *w, int64_t j)
 {
     fbm_edge_job job = {.g = {NULL}};
-    edge_job(w, weights_at(w, j, true), &job);
     for (int k = 0; k < 3; k++) {
         job.side[k] = ring_row(w->centre, j - 1 + k);
         if (w->noisy)
@@ -246,7 +284,7 @@ static void stencil_column_edges(const walk *w, int64_t j)
         job.same[k] = input(w, w->column - 1, j - 1 + k);
     for (int k = 0; k < 2; k++)
         job.other[k] = ring_row(w->row_noise, j + k);
-    w->kernel->edges(&job, w->count);
+    make_edges(w, FBM_NOISE_COLUMN_EDGES, j, &job);
 }
 
 /* ---- Means ------------------------------------------------------------------------------------- */
@@ -380,6 +418,7 @@ void fbm_refine_by(const fbm_kernel *kernel, const fbm_step *step, const float *
     if (!out_window.width || !out_window.height)
         return;
     require(contains(in_window, fbm_refine_support(step->scheme, out_window)) && out_window.stride >= out_window.width);
+    require(!step->places || fbm_scheme_has_places(step->scheme));
     int rule = step->scheme->rule;
     if (rule == RULE_CHILDREN || rule == RULE_ADDITIONS) {
         fbm_classic_refine(kernel, step, rule == RULE_CHILDREN, in, map, in_window, out, out_window, scratch);

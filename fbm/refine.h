@@ -11,18 +11,13 @@
 #define FBM_REFINE_H
 
 #include "fbm/aspect.h"
+#include "fbm/places.h"
 #include "fbm/weights.h"
+#include "fbm/window.h"
 
 #include <stdbool.h>
 #include <stddef.h>
 #include <stdint.h>
-
-/* A rectangle of a lattice, and how it lies in memory: sample (i + x, j + y) is at [y * stride + x]. */
-typedef struct fbm_window {
-    int64_t i, j;         /* lattice coordinates of the first sample; |i|, |j| < 2^61 */
-    size_t width, height; /* samples */
-    size_t stride;        /* floats between the beginnings of rows, >= width */
-} fbm_window;
 
 /* A rule of refinement, found by name. */
 typedef struct fbm_scheme {
@@ -63,7 +58,13 @@ typedef struct fbm_step {
     /* Columns of the input after which the noise comes again, so that a surface that goes around a globe joins; 0: it
      * never does. */
     int64_t period;
+    /* Coefficients that change from place to place, instead of `weights`, `rows` and `amplitude` (of which counts only
+     * whether it is 0); see fbm_scheme_has_places. NULL: they do not. */
+    const fbm_places *places;
 } fbm_step;
+
+/* Whether steps of a scheme may have coefficients by place. */
+bool fbm_scheme_has_places(const fbm_scheme *scheme);
 
 /* The input window of level l from which fbm_refine makes the window `out` of level l + 1: from column
  * floor(out.i / 2) - margin to floor((out.i + out.width - 1) / 2) + margin, likewise for rows, so that a halo of h

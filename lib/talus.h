@@ -615,8 +615,8 @@ typedef enum tl_support {
 
 typedef struct tl_field_options {
     int levels; /* halvings of the DEM's spacing, 0 ... 30 */
-    /* A name of tl_schemes() with `field`; NULL: "terrain" where neither hurst nor delta is given, else "stationary".
-     */
+    /* A name of tl_schemes() with `field`; NULL: "terrain" where neither hurst nor delta nor a map is given, else
+     * "stationary". */
     const char *scheme;
     bool hurst_given, delta_given;
     double hurst; /* Hurst exponent of every level below the DEM, 0.01 ... 0.99; where not given, measured */
@@ -625,6 +625,18 @@ typedef struct tl_field_options {
     uint64_t seed;
     const tl_run *run; /* for the measurement, which reads the DEM once */
     tl_support support;
+    /* Rasters of the Hurst exponent (0.01 ... 0.99) and of delta (0 ... 1e30, in units of height) from place to place,
+     * for schemes of fBm; NULL: one value everywhere. They are laid over the DEM by coordinates where both are
+     * georeferenced, in one CRS, else from edge to edge, and are sampled bilinearly at the DEM's samples; beyond a
+     * map's rim its last values go on, and where it is void the DEM's own value holds: `hurst` and `delta`, else what
+     * is measured. Between the samples both go on bilinearly, and an octave l below the DEM has the amplitude
+     * delta 2^(-l H) of the place. A map of the exponent is for the scheme "stationary" and cells of 0.71 ... 1.41
+     * times their height; the exponent of every octave below is then the map's. Both are read once when the field is
+     * created, and must outlive it. */
+    const tl_source *hurst_map, *delta_map;
+    /* The delta map holds sigma of the finest octave instead, as the second band of tl_statistics_write_maps does;
+     * delta is then that of fBm with this detail and the place's exponent. */
+    bool delta_map_is_sigma;
 } tl_field_options;
 
 /* The terrain below the DEM's samples: a source at level options->levels. A point raster of W x H samples

@@ -10,13 +10,15 @@
 typedef struct points {
     fbm_window window;
     float *heights;
+    const scene_planes *planes;
 } points;
 
-static tl_status load(void *context, fbm_window w, float *buffer, float *map, tl_error *error)
+static tl_status load(void *context, fbm_window w, float *buffer, float *const planes[SCENE_PLANES], tl_error *error)
 {
-    (void)map;
     (void)error;
     const points *p = context;
+    if (p->planes)
+        scene_planes_cut(p->planes, w, planes);
     const float *from = p->heights + (size_t)(w.j - p->window.j) * p->window.width + (size_t)(w.i - p->window.i);
     for (size_t row = 0; row < w.height; row++)
         memcpy(buffer + row * w.width, from + row * p->window.width, w.width * sizeof *buffer);
@@ -115,7 +117,7 @@ static tl_status impulse_response(const scene_cell_means *m, const scene_chain *
     fbm_window window = dense(-SPREAD, row - SPREAD, SIDE, SIDE);
     scene_chain_target cells = target_of(m->level, finer(window, m->level), NULL);
     fbm_window support = scene_chain_support(chain, &cells);
-    points p = {support, calloc(support.width * support.height, sizeof(float))};
+    points p = {support, calloc(support.width * support.height, sizeof(float)), NULL};
     if (!p.heights)
         return tl_fail_memory(error, name);
     p.heights[(size_t)(row - support.j) * support.width + (size_t)-support.i] = 1;
@@ -158,6 +160,7 @@ tl_status scene_cell_means_measure(const scene_chain *chain, int64_t row, int le
 {
     *out = (scene_cell_means){.level = levels < SCENE_MEANS_LEVEL ? levels : SCENE_MEANS_LEVEL};
     scene_chain smooth = *chain; /* shares what it points to */
+    smooth.mapped = smooth.placed = false;
     for (int l = 0; l <= SCENE_LEVEL_MAX; l++)
         smooth.steps[l].amplitude = 0;
     for (int k = 0; k < 2; k++)
@@ -228,10 +231,11 @@ static size_t area(fbm_window w)
 }
 
 tl_status scene_cell_means_run(const scene_cell_means *m, const scene_chain *chain, int level, fbm_window window,
-                               const scene_patch *patch, float *out, const char *name, tl_error *error)
+                               const scene_patch *patch, const scene_planes *planes, float *out, const char *name,
+                               tl_error *error)
 {
     fbm_window at = points_window(m, chain, level, window), wide = errors_window(at), cells = coarser(window, level);
-    points own = {patch->window, patch->heights}, chosen = {at, tl_alloc(area(at), sizeof(float))};
+    points own = {patch->window, patch->heights, planes}, chosen = {at, tl_alloc(area(at), sizeof(float)), planes};
     double *errors = tl_alloc(area(wide), sizeof *errors);
     tl_status status = chosen.heights && errors ? TL_OK : tl_fail_memory(error, name);
     if (status == TL_OK)

@@ -24,8 +24,10 @@ tl_status scene_cell_means_measure(const scene_chain *chain, int64_t row, int le
 /* The window of level 0 from which scene_cell_means_run makes a window of cells of level `level`. */
 fbm_window scene_cell_means_support(const scene_cell_means *means, const scene_chain *chain, int level,
                                     fbm_window window);
-/* Makes a window of cells of level `level` > 0 from a patch of that window, the raster's means. */
+/* Makes a window of cells of level `level` > 0 from a patch of that window, the raster's means. `planes`: of the same
+ * window, what the chain is to be told. */
 tl_status scene_cell_means_run(const scene_cell_means *means, const scene_chain *chain, int level, fbm_window window,
-                               const scene_patch *patch, float *out, const char *name, tl_error *error);
+                               const scene_patch *patch, const scene_planes *planes, float *out, const char *name,
+                               tl_error *error);
 
 #endif

@@ -1,9 +1,11 @@
 #include "lib/scene/chain.h"
 
+#include "fbm/elementary.h"
 #include "lib/base/error.h"
 #include "lib/base/size.h"
 
 #include <assert.h>
+#include <math.h>
 #include <pthread.h>
 #include <string.h>
 
@@ -17,9 +19,15 @@ typedef struct work {
     int stages;
     bool centres;
     fbm_window windows[STAGES + 1];
-    size_t step_x, step_y;    /* of the target in what is made */
-    float *level[2], *map[2]; /* before even and odd stages */
-    float *made;              /* NULL: it is made in its place */
+    size_t step_x, step_y; /* of the target in what is made */
+    float *level[2];       /* before even and odd stages */
+    /* Planes before even and odd stages. Where they are of coefficients by place, they lag behind: the stages s and
+     * s - FBM_PLACES_SHIFT go together, and fields[s] is the planes' window. */
+    float *planes[2][SCENE_PLANES];
+    fbm_window fields[STAGES + 1];
+    int field; /* the stage that the coefficients of strength 1 are of, -1: none */
+    float *unit, *values, *strengths, *place_scratch;
+    float *made; /* NULL: it is made in its place */
     float *scratch;
     void *rows; /* weights that follow the rows */
 } work;
@@ -71,6 +79,50 @@ static fbm_window asked_for(const scene_chain *chain, fbm_window window)
     return chain->shape.turned ? transposed(window) : window;
 }
 
+/* The stage on whose vertices the coefficients of a stage lie. */
+static int field_of(const work *w, int stage)
+{
+    int halvings = w->chain->shape.halvings;
+    return stage - FBM_PLACES_SHIFT > halvings ? stage - FBM_PLACES_SHIFT : halvings;
+}
+
+/* The vertices of coefficients that span a stage's input. */
+static fbm_window vertices_of(const work *w, int stage)
+{
+    const fbm_window *from = &w->windows[stage];
+    int shift = stage - field_of(w, stage);
+    int64_t unit = INT64_C(1) << shift, last_i = from->i + (int64_t)from->width - 1,
+            last_j = from->j + (int64_t)from->height - 1;
+    fbm_window of = {.i = from->i >> shift, .j = from->j >> shift};
+    of.width = of.stride = (size_t)(((last_i + unit - 1) >> shift) - of.i + 1);
+    of.height = (size_t)(((last_j + unit - 1) >> shift) - of.j + 1);
+    return of;
+}
+
+static fbm_window hull(fbm_window a, fbm_window b)
+{
+    int64_t i = tl_int64_min(a.i, b.i), j = tl_int64_min(a.j, b.j);
+    int64_t right = tl_int64_max(a.i + (int64_t)a.width, b.i + (int64_t)b.width);
+    int64_t below = tl_int64_max(a.j + (int64_t)a.height, b.j + (int64_t)b.height);
+    return (fbm_window){i, j, (size_t)(right - i), (size_t)(below - j), (size_t)(right - i)};
+}
+
+/* The planes' windows. Up to the first level they are the heights'; those of later stages take less of it than the
+ * heights do, which need 4 samples more on every side for a level where planes need one. */
+static void plan_fields(work *w)
+{
+    int first = w->chain->shape.halvings, last_stage = w->stages - !w->centres, last = field_of(w, last_stage);
+    for (int s = 0; s <= first; s++)
+        w->fields[s] = w->windows[s];
+    for (int s = last; s > first; s--) {
+        w->fields[s] = vertices_of(w, s + FBM_PLACES_SHIFT);
+        if (s < last)
+            w->fields[s] = hull(w->fields[s], fbm_refine_support(fbm_scheme_find("square"), w->fields[s + 1]));
+    }
+    for (int s = 0; s <= last; s++)
+        w->fields[s].stride = w->fields[s].width;
+}
+
 fbm_window scene_chain_support(const scene_chain *chain, const scene_chain_target *target)
 {
     work w;
@@ -84,8 +136,13 @@ static void work_free(work *w)
 {
     for (int k = 0; k < 2; k++) {
         free(w->level[k]);
-        free(w->map[k]);
+        for (int p = 0; p < SCENE_PLANES; p++)
+            free(w->planes[k][p]);
     }
+    free(w->unit);
+    free(w->values);
+    free(w->strengths);
+    free(w->place_scratch);
     free(w->made);
     free(w->scratch);
     free(w->rows);
@@ -94,6 +151,40 @@ static void work_free(work *w)
 static size_t larger(size_t a, size_t b)
 {
     return a > b ? a : b;
+}
+
+/* Room for a plane before even and odd stages. */
+static bool allocate_planes(work *w, const size_t most[2])
+{
+    const bool wanted[SCENE_PLANES] = {w->chain->mapped || w->chain->placed, w->chain->placed};
+    for (int k = 0; k < 2; k++)
+        for (int p = 0; p < SCENE_PLANES; p++) {
+            w->planes[k][p] = wanted[p] ? tl_alloc(most[k], sizeof(float)) : NULL;
+            if (wanted[p] && !w->planes[k][p])
+                return false;
+        }
+    return true;
+}
+
+/* Room for the coefficients of any stage. */
+static bool allocate_places(work *w)
+{
+    size_t most = 1, widest = 1, last = (size_t)(w->stages + w->centres);
+    for (size_t s = (size_t)w->chain->shape.halvings; s < last; s++) {
+        fbm_window of = w->fields[field_of(w, (int)s)];
+        most = larger(most, of.width * of.height); /* no more than the heights, whose size is checked */
+        widest = larger(widest, of.width);
+    }
+    bool square = w->chain->places.square;
+    size_t units, values;
+    if (!tl_size_mul(most, fbm_places_unit_size(square), &units) ||
+        !tl_size_mul(most, fbm_places_size(square), &values))
+        return false;
+    w->unit = tl_alloc(units, sizeof(float));
+    w->values = tl_alloc(values, sizeof(float));
+    w->strengths = tl_alloc(widest, sizeof(float));
+    w->place_scratch = tl_alloc(fbm_places_scratch(square, widest), sizeof(float));
+    return w->unit && w->values && w->strengths && w->place_scratch;
 }
 
 /* Room for every window of the plan but the one that is written straight to the caller. */
@@ -115,9 +206,12 @@ static bool allocate(work *w, bool in_place)
     bool good = true;
     for (int k = 0; k < 2; k++) {
         w->level[k] = tl_alloc(most[k], sizeof(float));
-        w->map[k] = w->chain->mapped ? tl_alloc(most[k], sizeof(float)) : NULL;
-        good = good && w->level[k] && (w->map[k] || !w->chain->mapped);
+        good = good && w->level[k];
     }
+    w->field = -1;
+    if (w->chain->placed)
+        plan_fields(w);
+    good = good && allocate_planes(w, most) && (!w->chain->placed || allocate_places(w));
     size_t scratch = larger(fbm_refine_scratch(2 * width), fbm_rows_scratch(width));
     w->scratch = tl_alloc(scratch, sizeof(float));
     w->made = in_place ? NULL : tl_alloc(last, sizeof(float));
@@ -149,7 +243,7 @@ static fbm_step step_at(work *w, int stage)
 {
     const scene_chain *c = w->chain;
     fbm_step step = c->steps[stage - c->shape.halvings];
-    if (!c->tables)
+    if (!c->tables || c->placed)
         return step;
     fbm_window from = w->windows[stage];
     fbm_weights *rows = w->rows;
@@ -181,31 +275,90 @@ static fbm_row_step row_step_at(work *w, int stage)
 
 /* ---- Refining ---------------------------------------------------------------------------------- */
 
-/* The map of the next stage, bilinear between the vertices of this one: means, without noise. */
-static void refine_map(work *w, int stage)
+/* The planes of the next stage, bilinear between the vertices of this one: means, without noise. */
+static void refine_planes(work *w, int stage, fbm_window from, fbm_window to)
 {
-    const float *map = w->map[stage & 1];
-    float *out = w->map[(stage + 1) & 1];
-    if (stage < w->chain->shape.halvings) {
-        fbm_row_step means = {.weights = {.w = {.5F}}};
-        fbm_refine_rows(&means, map, NULL, w->windows[stage], out, w->windows[stage + 1], w->scratch);
-        return;
-    }
     fbm_step means = {.scheme = fbm_scheme_find("square")};
     means.scheme->weights(.5, &means.weights);
-    fbm_refine(&means, map, w->windows[stage], out, w->windows[stage + 1], w->scratch);
+    fbm_row_step row_means = {.weights = {.w = {.5F}}};
+    for (int p = 0; p < SCENE_PLANES; p++) {
+        const float *in = w->planes[stage & 1][p];
+        float *out = w->planes[(stage + 1) & 1][p];
+        if (in && stage < w->chain->shape.halvings)
+            fbm_refine_rows(&row_means, in, NULL, from, out, to, w->scratch);
+        else if (in)
+            fbm_refine(&means, in, from, out, to, w->scratch);
+    }
+}
+
+/* Brings the planes, and the coefficients of strength 1, to the vertices that a stage's coefficients lie on. */
+static void advance_fields(work *w, int stage)
+{
+    const scene_chain *c = w->chain;
+    int wanted = field_of(w, stage);
+    if (w->field == wanted)
+        return;
+    for (int s = w->field < 0 ? c->shape.halvings : w->field; s < wanted; s++)
+        refine_planes(w, s, w->fields[s], w->fields[s + 1]);
+    w->field = wanted;
+    const fbm_window *of = &w->fields[wanted];
+    double unit = 2 * half_row(wanted);
+    for (size_t row = 0; row < of->height; row++) {
+        double log = c->tables ? log_aspect(&c->shape, (double)(of->j + (int64_t)row) * unit) : c->places.low;
+        fbm_places_unit(&c->places, log, w->planes[wanted & 1][SCENE_HURST] + row * of->width, of->width,
+                        w->unit + row * of->width * fbm_places_unit_size(c->places.square));
+    }
+}
+
+/* The coefficients of a stage. */
+static fbm_places places_at(work *w, int stage)
+{
+    const scene_chain *c = w->chain;
+    advance_fields(w, stage);
+    int field = w->field;
+    const bool square = c->places.square;
+    const fbm_window *of = &w->fields[field], window = vertices_of(w, stage);
+    const double fall = c->fall + (double)(stage - c->shape.halvings);
+    const size_t first = (size_t)(window.i - of->i);
+    for (size_t row = 0; row < window.height; row++) {
+        size_t at = (row + (size_t)(window.j - of->j)) * of->width + first;
+        fbm_places_scale(&c->places, fall, w->planes[field & 1][SCENE_STRENGTH] + at,
+                         w->planes[field & 1][SCENE_HURST] + at, window.width,
+                         w->unit + at * fbm_places_unit_size(square), w->strengths,
+                         w->values + row * window.width * fbm_places_size(square));
+    }
+    return (fbm_places){
+        .shift = stage - field, .square = square, .window = window, .values = w->values, .scratch = w->place_scratch};
 }
 
 static void run_stage(work *w, int stage, float *out)
 {
-    const float *in = w->level[stage & 1], *map = w->map[stage & 1];
+    const float *in = w->level[stage & 1], *map = w->chain->placed ? NULL : w->planes[stage & 1][SCENE_STRENGTH];
     if (stage < w->chain->shape.halvings) {
         fbm_row_step step = row_step_at(w, stage);
         fbm_refine_rows(&step, in, map, w->windows[stage], out, w->windows[stage + 1], w->scratch);
-    } else {
-        fbm_step step = step_at(w, stage);
-        fbm_refine_mapped(&step, in, map, w->windows[stage], out, w->windows[stage + 1], w->scratch);
+        return;
     }
+    fbm_step step = step_at(w, stage);
+    fbm_places places;
+    if (w->chain->placed) {
+        places = places_at(w, stage);
+        step.places = &places;
+    }
+    fbm_refine_mapped(&step, in, map, w->windows[stage], out, w->windows[stage + 1], w->scratch);
+}
+
+static void run_centres(work *w, float *out, fbm_window cells)
+{
+    int stage = w->stages;
+    fbm_step step = step_at(w, stage);
+    fbm_places places;
+    if (w->chain->placed) {
+        places = places_at(w, stage);
+        step.places = &places;
+    }
+    fbm_centres_mapped(&step, w->level[stage & 1], w->chain->placed ? NULL : w->planes[stage & 1][SCENE_STRENGTH],
+                       w->windows[stage], out, cells, w->scratch);
 }
 
 /* Makes `out`, of the last window; for centres, of the window `cells`. */
@@ -214,14 +367,12 @@ static void refine_all(work *w, float *out, fbm_window cells)
     for (int s = 0; s < w->stages; s++) {
         bool last = s + 1 == w->stages && !w->centres;
         run_stage(w, s, last ? out : w->level[(s + 1) & 1]);
-        if (w->chain->mapped && !last)
-            refine_map(w, s);
+        bool halving = s < w->chain->shape.halvings;
+        if (!last && (w->chain->placed ? halving : w->chain->mapped))
+            refine_planes(w, s, w->windows[s], w->windows[s + 1]);
     }
-    if (w->centres) {
-        fbm_step step = step_at(w, w->stages);
-        fbm_centres_mapped(&step, w->level[w->stages & 1], w->map[w->stages & 1], w->windows[w->stages], out, cells,
-                           w->scratch);
-    }
+    if (w->centres)
+        run_centres(w, out, cells);
 }
 
 /* Takes the target's samples out of what was made, turned back if it was turned. */
@@ -247,15 +398,22 @@ static tl_status load_turned(work *w, scene_chain_load load, void *context, cons
 {
     fbm_window window = asked_for(w->chain, w->windows[0]);
     size_t count = window.width * window.height;
-    float *heights = tl_alloc(count, sizeof *heights), *map = w->chain->mapped ? tl_alloc(count, sizeof *map) : NULL;
-    tl_status status = heights && (map || !w->chain->mapped) ? load(context, window, heights, map, error)
-                                                             : tl_fail_memory(error, name);
+    float *heights = tl_alloc(count, sizeof *heights), *planes[SCENE_PLANES] = {NULL};
+    bool good = heights != NULL;
+    for (int p = 0; p < SCENE_PLANES && good; p++)
+        if (w->planes[0][p]) {
+            planes[p] = tl_alloc(count, sizeof *planes[p]);
+            good = planes[p] != NULL;
+        }
+    tl_status status = good ? load(context, window, heights, planes, error) : tl_fail_memory(error, name);
     if (status == TL_OK)
         transpose(heights, window.width, window.height, w->level[0]);
-    if (status == TL_OK && map)
-        transpose(map, window.width, window.height, w->map[0]);
+    for (int p = 0; p < SCENE_PLANES; p++) {
+        if (status == TL_OK && planes[p])
+            transpose(planes[p], window.width, window.height, w->planes[0][p]);
+        free(planes[p]);
+    }
     free(heights);
-    free(map);
     return status;
 }
 
@@ -285,13 +443,14 @@ tl_status scene_chain_run(const scene_chain *chain, const scene_chain_target *ta
     if (status == TL_OK && w.stages == 0 && !w.centres) { /* level 0: what is loaded is what is made */
         free(w.level[0]);
         w.level[0] = w.made;
-        free(w.map[0]);
-        w.map[0] = chain->mapped ? tl_alloc(w.windows[0].width, w.windows[0].height * sizeof(float)) : NULL;
-        status = chain->mapped && !w.map[0] ? tl_fail_memory(error, name) : TL_OK;
+        for (int p = 0; p < SCENE_PLANES; p++) {
+            free(w.planes[0][p]);
+            w.planes[0][p] = NULL;
+        }
     }
     if (status == TL_OK)
         status = turned ? load_turned(&w, load, context, name, error)
-                        : load(context, w.windows[0], w.level[0], w.map[0], error);
+                        : load(context, w.windows[0], w.level[0], w.planes[0], error);
     if (status == TL_OK && w.centres && turned)
         status = run_turned_centres(&w, target, name, error);
     else if (status == TL_OK)
@@ -302,6 +461,34 @@ tl_status scene_chain_run(const scene_chain *chain, const scene_chain_target *ta
         w.made = NULL;
     work_free(&w);
     return status;
+}
+
+tl_status scene_chain_fit_places(scene_chain *chain, const char *name, tl_error *error)
+{
+    const scene_shape *shape = &chain->shape;
+    double log = fbm_log2(ldexp(shape->aspect, shape->halvings));
+    double low = chain->tables ? shape->low : log, high = chain->tables ? shape->high : log;
+    chain->place_values = tl_alloc(fbm_places_table_size(low, high), sizeof(float));
+    if (!chain->place_values)
+        return tl_fail_memory(error, name);
+    fbm_places_table_make(low, high, chain->place_values, &chain->places);
+    chain->placed = chain->mapped = true;
+    /* delta is over the geometric mean of a cell's sides, the noise is in units of the rows' spacing */
+    chain->fall = shape->halvings + fbm_log2(shape->aspect) / 2;
+    for (int l = 0; l <= SCENE_LEVEL_MAX; l++)
+        chain->steps[l].amplitude = 1;
+    return TL_OK;
+}
+
+void scene_planes_cut(const scene_planes *planes, fbm_window part, float *const out[SCENE_PLANES])
+{
+    const fbm_window *w = &planes->window;
+    assert(part.i >= w->i && part.j >= w->j && part.width <= w->width && part.height <= w->height);
+    for (int p = 0; p < SCENE_PLANES; p++)
+        for (size_t row = 0; out[p] && row < part.height; row++)
+            memcpy(out[p] + row * part.width,
+                   planes->of[p] + ((size_t)(part.j - w->j) + row) * w->width + (size_t)(part.i - w->i),
+                   part.width * sizeof *out[p]);
 }
 
 const fbm_scheme *scene_scheme(const char *name, tl_error *error)

@@ -21,6 +21,11 @@ typedef struct scene_shape {
 typedef struct scene_chain {
     fbm_step steps[SCENE_LEVEL_MAX + 1]; /* steps[l] leads from level l to level l + 1 */
     bool mapped;                         /* the noise has a strength that varies: `load` tells it */
+    /* The exponent varies, too, as `load` tells it, and the strength is then delta; see scene_chain_fit_places. */
+    bool placed;
+    fbm_places_table places;
+    float *place_values;
+    double fall; /* of the noise before the first level: its amplitude is delta 2^(-(fall + level) H) */
     scene_shape shape;
     fbm_row_step row_steps[2]; /* of the halvings */
     /* Weights that follow the rows, where the shape does; NULL, or [SCENE_LEVEL_MAX + 1] and [2]. */
@@ -36,11 +41,27 @@ tl_status scene_chain_fit(scene_chain *chain, const tl_source_info *raster, cons
                           bool strict, tl_error *error);
 /* The same for cells of one shape, of which nothing is kept to be freed. `aspect`: 0.2 ... 5. */
 void scene_chain_fit_aspect(scene_chain *chain, double aspect, const double *hursts, int levels);
+/* Makes a chain that was fitted one whose strength and exponent are fields. Its scheme must be one of
+ * fbm_scheme_has_places. */
+tl_status scene_chain_fit_places(scene_chain *chain, const char *name, tl_error *error);
 void scene_chain_finish(scene_chain *chain);
 
-/* Fills buffer[window.width * window.height] with the heights of level 0, all finite, and `map`, unless NULL, with the
- * factors on the noise there. */
-typedef tl_status (*scene_chain_load)(void *context, fbm_window window, float *buffer, float *map, tl_error *error);
+/* Planes beside the heights of level 0: the factor on the noise, and the Hurst exponent. */
+enum { SCENE_STRENGTH, SCENE_HURST, SCENE_PLANES };
+
+/* Some of them over a window, without gaps between rows; NULL: not this one. */
+typedef struct scene_planes {
+    fbm_window window;
+    float *of[SCENE_PLANES];
+} scene_planes;
+
+/* Copies a part of them to `out`, where that is not NULL; likewise without gaps. */
+void scene_planes_cut(const scene_planes *planes, fbm_window part, float *const out[SCENE_PLANES]);
+
+/* Fills buffer[window.width * window.height] with the heights of level 0, all finite, and those of `planes` that are
+ * not NULL likewise: factors on the noise, >= 0, and exponents of FBM_HURST_MIN ... FBM_HURST_MAX. */
+typedef tl_status (*scene_chain_load)(void *context, fbm_window window, float *buffer,
+                                      float *const planes[SCENE_PLANES], tl_error *error);
 
 /* Where the heights of one call go: the samples of a lattice, or the centres of its cells (see fbm_centres). */
 typedef struct scene_chain_target {

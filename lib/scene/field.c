@@ -8,6 +8,7 @@
 #include "lib/base/size.h"
 #include "lib/scene/cell_means.h"
 #include "lib/scene/chain.h"
+#include "lib/scene/field_map.h"
 #include "lib/scene/patch.h"
 #include "lib/scene/roughness.h"
 #include "lib/scene/terrain.h"
@@ -18,6 +19,7 @@
 #include <string.h>
 
 enum {
+    UNITS = 99,  /* of exponents 0.01 ... 0.99: see units_of */
     BLOCK = 512, /* reads are cut into blocks of at most this, so that the levels of one stay in cache */
     /* Cells beyond the known samples that are made up so that the predictor has something to see. The output lies at
      * most half a cell outside of a known sample, and the halo of the refinement converges to 8 cells. */
@@ -33,6 +35,9 @@ typedef struct field {
     scene_terrain *terrain; /* of cell means, or the strengths of the chain's noise; NULL: neither */
     scene_cell_means means; /* level 0: not for this field */
     scene_growth growth;    /* beyond the rim, but for its rings */
+    /* Fields of exponent and delta; without sources where there is no map. */
+    scene_field_map maps[SCENE_PLANES];
+    double units[UNITS]; /* sigma over delta at exponents 0.01, 0.02 ...; all 1 where the map is of delta */
     double deltas[SCENE_LEVEL_MAX + 1], hursts[SCENE_LEVEL_MAX + 1]; /* see scene_field_fractal */
     tl_parameter *parameters;
 } field;
@@ -62,13 +67,15 @@ static void cut_voids(const scene_patch *g, bool area, int level, tl_window wind
 
 /* ---- reading ---- */
 
-/* Level 0 under a block: a patch that may reach farther than the chain asks for, and the strengths of the noise. */
+/* Level 0 under a block: a patch that may reach farther than the chain asks for, and planes of the window that it asks
+ * for. */
 typedef struct ground {
     scene_patch patch;
-    float *strengths; /* of the window that the chain asks for */
+    scene_planes planes;
 } ground;
 
-static tl_status load(void *context, fbm_window window, float *buffer, float *map, tl_error *error)
+static tl_status load(void *context, fbm_window window, float *buffer, float *const planes[SCENE_PLANES],
+                      tl_error *error)
 {
     (void)error;
     const ground *g = context;
@@ -77,33 +84,67 @@ static tl_status load(void *context, fbm_window window, float *buffer, float *ma
     const float *from = g->patch.heights + (size_t)(window.j - w->j) * w->width + (size_t)(window.i - w->i);
     for (size_t row = 0; row < window.height; row++)
         memcpy(buffer + row * window.width, from + row * w->width, window.width * sizeof *buffer);
-    if (map)
-        memcpy(map, g->strengths, window.width * window.height * sizeof *map);
+    scene_planes_cut(&g->planes, window, planes);
     return TL_OK;
+}
+
+/* Sigma over delta at an exponent. */
+static double unit_at(const field *f, double hurst)
+{
+    double place = fmin(fmax(100 * hurst - 1, 0), UNITS - 1);
+    int at = place < UNITS - 1 ? (int)place : UNITS - 2;
+    return f->units[at] + (place - at) * (f->units[at + 1] - f->units[at]);
+}
+
+/* The planes of maps: delta, and the exponent where that has a map. */
+static tl_status read_maps(const field *f, fbm_window window, scene_planes *out, tl_error *error)
+{
+    float *delta = out->of[SCENE_STRENGTH], *hurst = out->of[SCENE_HURST];
+    const scene_field_map *maps = f->maps;
+    tl_status status = scene_field_map_read(&maps[SCENE_STRENGTH], window, delta, error);
+    if (status == TL_OK && hurst)
+        status = scene_field_map_read(&maps[SCENE_HURST], window, hurst, error);
+    for (size_t k = 0; status == TL_OK && k < window.width * window.height; k++) {
+        if (hurst) /* bilinear to rounding */
+            hurst[k] = fminf(fmaxf(hurst[k], (float)FBM_HURST_MIN), (float)FBM_HURST_MAX);
+        double unit = unit_at(f, hurst ? (double)hurst[k] : maps[SCENE_HURST].fallback);
+        if (unit != 1)
+            delta[k] = (float)((double)delta[k] / unit);
+    }
+    return status;
+}
+
+static tl_status read_planes(const field *f, fbm_window window, ground *g, tl_error *error)
+{
+    const char *name = f->dem->info.name;
+    g->planes.window = window;
+    for (int p = 0; p < SCENE_PLANES; p++)
+        if (p == SCENE_STRENGTH || f->chain.placed) {
+            g->planes.of[p] = tl_alloc_grid((int64_t)window.width, (int64_t)window.height, sizeof(float));
+            if (!g->planes.of[p])
+                return tl_fail_memory(error, name);
+        }
+    if (f->terrain)
+        return scene_terrain_strengths(f->terrain, &g->patch, window, g->planes.of[SCENE_STRENGTH], name, error);
+    return read_maps(f, window, &g->planes, error);
 }
 
 static tl_status ground_read(const field *f, fbm_window window, ground *g, tl_error *error)
 {
-    const char *name = f->dem->info.name;
     int rings = GROWTH + ROW_GROWTH * f->chain.shape.halvings;
     scene_growth growth = f->growth;
     growth.rings = rings;
-    *g = (ground){.strengths = NULL};
-    if (!f->chain.mapped)
-        return scene_patch_read(f->dem, growth, window, &g->patch, error);
-    tl_status status = scene_patch_read(f->dem, growth, scene_widened(window, FBM_ENERGY_MARGIN), &g->patch, error);
-    if (status == TL_OK) {
-        g->strengths = tl_alloc_grid((int64_t)window.width, (int64_t)window.height, sizeof *g->strengths);
-        status = g->strengths ? scene_terrain_strengths(f->terrain, &g->patch, window, g->strengths, name, error)
-                              : tl_fail_memory(error, name);
-    }
-    return status;
+    *g = (ground){.planes = {.of = {NULL}}};
+    fbm_window wide = f->terrain ? scene_widened(window, FBM_ENERGY_MARGIN) : window;
+    tl_status status = scene_patch_read(f->dem, growth, wide, &g->patch, error);
+    return status == TL_OK && f->chain.mapped ? read_planes(f, window, g, error) : status;
 }
 
 static void ground_free(ground *g)
 {
     scene_patch_free(&g->patch);
-    free(g->strengths);
+    for (int p = 0; p < SCENE_PLANES; p++)
+        free(g->planes.of[p]);
 }
 
 /* The lattice window, or the window of cells, that a window of samples is. Cell k of an area raster at level l has its
@@ -141,7 +182,8 @@ static tl_status read_means(const field *f, int level, tl_window window, float *
     ground g;
     tl_status status = ground_read(f, support, &g, error);
     if (status == TL_OK)
-        status = scene_cell_means_run(&f->means, &f->chain, level, target, &g.patch, out, name, error);
+        status = scene_cell_means_run(&f->means, &f->chain, level, target, &g.patch, f->chain.mapped ? &g.planes : NULL,
+                                      out, name, error);
     if (status == TL_OK && g.patch.known)
         cut_voids(&g.patch, true, level, window, out, stride);
     ground_free(&g);
@@ -258,6 +300,10 @@ static tl_status check(const tl_source *dem, const tl_field_options *o, tl_error
         return tl_fail(error, TL_ERROR_ARGUMENT, "the Hurst exponent must be from 0.01 to 0.99, not %g", o->hurst);
     if (o->delta_given && !(o->delta >= 0 && o->delta <= 1e30))
         return tl_fail(error, TL_ERROR_ARGUMENT, "delta must be from 0 to 1e30, not %g", o->delta);
+    bool mapped = o->hurst_map || o->delta_map;
+    if (mapped && o->scheme && !strcmp(o->scheme, SCENE_TERRAIN))
+        return tl_fail(error, TL_ERROR_ARGUMENT,
+                       "scheme 'terrain' takes no maps of H and delta, it has its own; take 'stationary'");
     int64_t limit = INT64_C(1) << 60; /* coordinates of every level, and of the halo, must fit */
     if (info->level != 0 || info->width > limit >> o->levels || info->height > limit >> o->levels)
         return too_large(dem, o->levels, error);
@@ -279,6 +325,34 @@ static void schedule(const field *f, const tl_field_options *o, const tl_roughne
         if (!o->delta_given && (l == 0 || !o->hurst_given))
             amplitude = octaves[l].sigma / unit;
         octaves[l] = (scene_octave){.sigma = amplitude * unit, .hurst = hurst};
+    }
+}
+
+/* Of maps of delta (and of the exponent) the noise has the place's own strength: the octaves are left with what delta
+ * 1 gives them. */
+static void take_out_delta(field *f, const tl_field_options *o, const tl_roughness *measured, scene_octave *octaves)
+{
+    double hurst = fmin(fmax(octaves[0].hurst, FBM_HURST_MIN), FBM_HURST_MAX);
+    double delta = octaves[0].sigma / sqrt(fbm_detail_of_fbm(hurst, is_area(f)));
+    f->maps[SCENE_STRENGTH].fallback = delta;
+    f->maps[SCENE_HURST].fallback = hurst;
+    tl_field_options one = *o;
+    one.delta_given = true;
+    one.delta = 1;
+    if (!(delta > 0)) {
+        schedule(f, &one, measured, octaves);
+        return;
+    }
+    for (int l = 0; l <= SCENE_LEVEL_MAX; l++)
+        octaves[l].sigma /= delta;
+}
+
+/* Sigma of the octave whose parents are 2 samples apart, for delta 1, at exponents 0.01, 0.02 ... */
+static void units_of(field *f, bool sigma)
+{
+    for (int k = 0; k < UNITS; k++) {
+        double hurst = (k + 1) / 100.0;
+        f->units[k] = sigma ? fbm_exp2(hurst) * sqrt(fbm_detail_of_fbm(hurst, is_area(f))) : 1;
     }
 }
 
@@ -317,6 +391,38 @@ static tl_status set_steps(field *f, const tl_field_options *o, const scene_octa
     return status;
 }
 
+/* Lays the maps over the DEM and makes the chain follow them. */
+static tl_status open_maps(field *f, const tl_field_options *o, tl_error *error)
+{
+    const tl_source_info *dem = &f->dem->info;
+    scene_field_map *delta = &f->maps[SCENE_STRENGTH], *hurst = &f->maps[SCENE_HURST];
+    f->growth.delta = delta->fallback; /* of the model's surroundings */
+    if (o->hurst_map && f->chain.shape.halvings)
+        return tl_fail(error, TL_ERROR_ARGUMENT,
+                       "%s: a map of H needs cells that are 0.71 to 1.41 times as wide as high, not %.3g; reproject it",
+                       dem->name, dem->georef.cell_x / dem->georef.cell_y);
+    bool sigma = o->delta_map && o->delta_map_is_sigma;
+    units_of(f, sigma);
+    f->chain.mapped = true;
+    tl_status status = scene_field_map_open(o->hurst_map, dem, "Hurst exponents", FBM_HURST_MIN, FBM_HURST_MAX,
+                                            hurst->fallback, o->run, hurst, error);
+    double known = delta->fallback * (sigma ? unit_at(f, hurst->fallback) : 1);
+    if (status == TL_OK)
+        status =
+            scene_field_map_open(o->delta_map, dem, sigma ? "sigma" : "delta", 0, 1e30, known, o->run, delta, error);
+    for (int l = 0; o->hurst_map && l <= SCENE_LEVEL_MAX; l++) { /* no place has more */
+        f->hursts[l] = fmax(hurst->least, FBM_HURST_MIN);
+        f->deltas[l] = fbm_exp2(-l * f->hursts[l]);
+    }
+    return status == TL_OK && o->hurst_map ? scene_chain_fit_places(&f->chain, dem->name, error) : status;
+}
+
+static const char *name_alone(const tl_source *map)
+{
+    const char *slash = strrchr(map->info.name, '/');
+    return slash ? slash + 1 : map->info.name;
+}
+
 /* The record: pairs of name and value. */
 static tl_status note_all(field *f, const tl_field_options *o, const tl_roughness *measured, tl_error *error)
 {
@@ -337,6 +443,12 @@ static tl_status note_all(field *f, const tl_field_options *o, const tl_roughnes
     tl_status status = tl_parameters_add_origin(&f->parameters, &f->source.info.parameter_count, &f->dem->info, error);
     for (size_t i = 0; i < count && status == TL_OK; i++)
         status = tl_parameters_add(&f->parameters, &f->source.info.parameter_count, all[i].name, all[i].value, error);
+    if (status == TL_OK && o->hurst_map)
+        status = tl_parameters_add(&f->parameters, &f->source.info.parameter_count, "hurst_map",
+                                   name_alone(o->hurst_map), error);
+    if (status == TL_OK && o->delta_map)
+        status = tl_parameters_add(&f->parameters, &f->source.info.parameter_count,
+                                   o->delta_map_is_sigma ? "sigma_map" : "delta_map", name_alone(o->delta_map), error);
     f->source.info.parameters = f->parameters;
     return status;
 }
@@ -366,7 +478,8 @@ static void place(field *f, int levels)
 
 static tl_status prepare(field *f, const tl_field_options *o, tl_error *error)
 {
-    bool terrain = o->scheme ? !strcmp(o->scheme, SCENE_TERRAIN) : !o->hurst_given && !o->delta_given;
+    bool mapped = o->hurst_map || o->delta_map;
+    bool terrain = o->scheme ? !strcmp(o->scheme, SCENE_TERRAIN) : !o->hurst_given && !o->delta_given && !mapped;
     const fbm_scheme *scheme = scene_scheme(terrain ? NULL : o->scheme, error);
     if (!scheme)
         return TL_ERROR_ARGUMENT;
@@ -375,6 +488,8 @@ static tl_status prepare(field *f, const tl_field_options *o, tl_error *error)
         return tl_fail(error, TL_ERROR_ARGUMENT,
                        "%s: scheme '%s' refines cells, and these are points; take --support area, or another scheme",
                        f->dem->info.name, scheme->name);
+    if (o->hurst_map && !fbm_scheme_has_places(scheme))
+        return tl_fail(error, TL_ERROR_ARGUMENT, "scheme '%s' takes no map of H; take 'stationary'", scheme->name);
     for (int l = 0; l <= SCENE_LEVEL_MAX; l++)
         f->chain.steps[l] = (fbm_step){.scheme = scheme, .seed = o->seed, .level = l};
     scene_detail detail = {.noise = 0};
@@ -386,7 +501,11 @@ static tl_status prepare(field *f, const tl_field_options *o, tl_error *error)
     tl_roughness measured = scene_roughness_of(&detail, &f->dem->info.georef);
     scene_octave octaves[SCENE_LEVEL_MAX + 1];
     schedule(f, o, &measured, octaves);
+    if (mapped)
+        take_out_delta(f, o, &measured, octaves);
     status = set_steps(f, o, octaves, error);
+    if (status == TL_OK && mapped)
+        status = open_maps(f, o, error);
     if (status != TL_OK)
         return status;
     place(f, o->levels);
@@ -471,7 +590,7 @@ tl_status scene_field_strengths(const tl_source *source, tl_window window, float
     fbm_window from = {window.x, window.y, (size_t)window.width, (size_t)window.height, (size_t)window.width};
     tl_status status = ground_read(f, from, &g, error);
     if (status == TL_OK)
-        memcpy(out, g.strengths, count * sizeof *out);
+        memcpy(out, g.planes.of[SCENE_STRENGTH], count * sizeof *out);
     ground_free(&g);
     return status;
 }
@@ -484,7 +603,7 @@ tl_window scene_field_support(const tl_source *source, int level, tl_window wind
         scene_chain_target target = target_of(f, level, window, NULL, window.width);
         from = scene_chain_support(&f->chain, &target);
     }
-    if (f->chain.mapped)
+    if (f->terrain)
         from = scene_widened(from, FBM_ENERGY_MARGIN);
     int64_t right = tl_int64_min(from.i + (int64_t)from.width, f->dem->info.width);
     int64_t bottom = tl_int64_min(from.j + (int64_t)from.height, f->dem->info.height);

@@ -29,9 +29,10 @@ typedef struct noise {
     tl_parameter *parameters;
 } noise;
 
-static tl_status load(void *context, fbm_window window, float *buffer, float *map, tl_error *error)
+static tl_status load(void *context, fbm_window window, float *buffer, float *const planes[SCENE_PLANES],
+                      tl_error *error)
 {
-    (void)map;
+    (void)planes;
     (void)error;
     const noise *n = context;
     int64_t i = window.i + n->halo, j = window.j + n->halo;

@@ -207,4 +207,5 @@ void scene_chain_finish(scene_chain *chain)
     free(chain->shape.log_aspects);
     free(chain->tables);
     free(chain->row_tables);
+    free(chain->place_values);
 }

@@ -18,6 +18,10 @@ typedef struct chain {
     fbm_window windows[LEVELS + 1];
     float *heights[LEVELS + 1];
     float *scratch;
+    /* Coefficients by place: from fields on level 0. */
+    fbm_places_table table;
+    fbm_places places[LEVELS];
+    float *table_values, *unit, *values, *place_scratch, *strength, *hurst, *strengths;
 } chain;
 
 static void *allocate(size_t count, size_t size)
@@ -49,8 +53,57 @@ static void plan(chain *c, const fbm_scheme *scheme, size_t side)
     c->scratch = allocate(scratch, sizeof(float));
 }
 
+/* Fields of strength and exponent at the vertices of level 0, where the vertices of coefficients of these levels lie.
+ */
+static void plan_places(chain *c)
+{
+    const fbm_window *nodes = &c->windows[0];
+    size_t count = nodes->width * nodes->height, size = fbm_places_size(true);
+    c->table_values = allocate(fbm_places_table_size(0, 0), sizeof(float));
+    fbm_places_table_make(0, 0, c->table_values, &c->table);
+    c->unit = allocate(count * fbm_places_unit_size(true), sizeof(float));
+    c->values = allocate(count * size, sizeof(float));
+    c->strengths = allocate(count, sizeof(float));
+    c->place_scratch = allocate(fbm_places_scratch(true, nodes->width), sizeof(float));
+    c->strength = allocate(count, sizeof(float));
+    c->hurst = allocate(count, sizeof(float));
+    for (size_t k = 0; k < count; k++) {
+        c->strength[k] = 1 + (float)(k % 7) / 8;
+        c->hurst[k] = .3F + (float)(k % nodes->width) / 100;
+    }
+    for (int l = 0; l < LEVELS; l++)
+        c->places[l] = (fbm_places){
+            .shift = l, .square = true, .window = *nodes, .values = c->values, .scratch = c->place_scratch};
+}
+
+static void run_places(void *context)
+{
+    chain *c = context;
+    const fbm_window *nodes = &c->windows[0];
+    for (size_t row = 0; row < nodes->height; row++)
+        fbm_places_unit(&c->table, 0, c->hurst + row * nodes->width, nodes->width,
+                        c->unit + row * nodes->width * fbm_places_unit_size(true));
+    for (int l = c->first; l < LEVELS; l++) {
+        for (size_t row = 0; row < nodes->height; row++)
+            fbm_places_scale(&c->table, l, c->strength + row * nodes->width, c->hurst + row * nodes->width,
+                             nodes->width, c->unit + row * nodes->width * fbm_places_unit_size(true), c->strengths,
+                             c->values + row * nodes->width * fbm_places_size(true));
+        fbm_step step = c->steps[l];
+        step.places = &c->places[l];
+        fbm_refine_by(c->kernel, &step, c->heights[l], NULL, c->windows[l], c->heights[l + 1], c->windows[l + 1],
+                      c->scratch);
+    }
+}
+
 static void finish(chain *c)
 {
+    free(c->table_values);
+    free(c->unit);
+    free(c->values);
+    free(c->strengths);
+    free(c->place_scratch);
+    free(c->strength);
+    free(c->hurst);
     for (int l = 0; l <= LEVELS; l++)
         free(c->heights[l]);
     free(c->scratch);
@@ -87,6 +140,16 @@ static void measure(const fbm_scheme *scheme, size_t side)
         double level = bench_minimum(run_chain, &c, RUNS) / count;
         printf("  %-8s %7.3f ns %7.3f ns %7.3f ns %14.1f\n", (*kernel)->name, 1e9 * noise, 1e9 * level, 1e9 * levels,
                levels / copy);
+    }
+    if (fbm_scheme_has_places(scheme)) {
+        plan_places(&c);
+        c.first = 0;
+        for (const fbm_kernel *const *kernel = fbm_kernels(); *kernel; kernel++) {
+            c.kernel = *kernel;
+            double plain = bench_minimum(run_chain, &c, RUNS), by_place = bench_minimum(run_places, &c, RUNS);
+            printf("  %-8s with fields of H and delta, 4 levels: %.3f ns, %.2f times one H, %.1f copies\n",
+                   (*kernel)->name, 1e9 * by_place / count, by_place / plain, by_place / count / copy);
+        }
     }
     finish(&c);
 }

@@ -1,0 +1,164 @@
+#include "lib/scene/field_map.h"
+
+#include "dem/crs.h"
+#include "lib/base/error.h"
+#include "lib/base/number.h"
+#include "lib/base/size.h"
+
+#include <math.h>
+#include <string.h>
+
+/* ---- Laying -------------------------------------------------------------------------------------- */
+
+static void lay_by_place(const double *from, const double *to, double out[6])
+{
+    double determinant = to[1] * to[5] - to[2] * to[4];
+    const double inverse[4] = {to[5] / determinant, -to[2] / determinant, -to[4] / determinant, to[1] / determinant};
+    for (int k = 0; k < 3; k++) {
+        double x = from[k] - (k ? 0 : to[0]), y = from[3 + k] - (k ? 0 : to[3]);
+        out[k] = inverse[0] * x + inverse[1] * y;
+        out[3 + k] = inverse[2] * x + inverse[3] * y;
+    }
+}
+
+static void lay_edge_to_edge(const tl_source_info *model, const tl_source_info *map, double out[6])
+{
+    double x = (double)map->width / (double)model->width, y = (double)map->height / (double)model->height;
+    const double to[6] = {x / 2 - .5, x, 0, y / 2 - .5, 0, y};
+    memcpy(out, to, sizeof to);
+}
+
+static tl_status lay(const tl_source_info *model, const tl_source_info *map, double out[6], tl_error *error)
+{
+    const tl_georef *a = &model->georef, *b = &map->georef;
+    if (!a->located || !b->located) {
+        lay_edge_to_edge(model, map, out);
+        return TL_OK;
+    }
+    if (a->crs && b->crs && !dem_crs_equivalent(a->crs, b->crs))
+        return tl_fail(error, TL_ERROR_ARGUMENT, "%s: is in another CRS (%s) than %s (%s): reproject it to that",
+                       map->name, tl_crs_name(b->crs), model->name, tl_crs_name(a->crs));
+    if (!tl_transform_is_usable(b->transform))
+        return tl_fail(error, TL_ERROR_DATA, "%s: its place cannot be used: write it anew, georeferenced", map->name);
+    lay_by_place(a->transform, b->transform, out);
+    return TL_OK;
+}
+
+tl_status scene_field_map_open(const tl_source *map, const tl_source_info *model, const char *what, double low,
+                               double high, double fallback, const tl_run *run, scene_field_map *out, tl_error *error)
+{
+    *out = (scene_field_map){
+        .source = map, .fallback = fallback, .least = fallback, .turn = model->wraps ? model->width : 0};
+    if (!map)
+        return TL_OK;
+    tl_status status = lay(model, &map->info, out->to, error);
+    tl_range range;
+    tl_run quiet = run ? *run : (tl_run){0};
+    quiet.progress = NULL;
+    if (status == TL_OK)
+        status = tl_source_range(map, &quiet, &range, error);
+    if (status == TL_OK && range.voids < range.samples && !(range.low >= (float)low && range.high <= (float)high))
+        return tl_fail(error, TL_ERROR_DATA, "%s: holds %g ... %g, but %s must be from %g to %g; is it the right band?",
+                       map->info.name, (double)range.low, (double)range.high, what, low, high);
+    if (status == TL_OK)
+        out->least = fmin(fallback, (double)range.low);
+    return status;
+}
+
+/* ---- Reading ------------------------------------------------------------------------------------- */
+
+/* What is read of the map for a window. */
+typedef struct sheet {
+    tl_window window;
+    float *numbers;
+} sheet;
+
+static double position(const double *to, double i, double j)
+{
+    return to[0] + to[1] * i + to[2] * j;
+}
+
+static double column_of(const scene_field_map *map, int64_t i)
+{
+    int64_t rest = map->turn ? i % map->turn : i;
+    return (double)(rest < 0 ? rest + map->turn : rest);
+}
+
+/* The samples of one axis of the map that columns (or rows) at positions low ... high see. */
+static void span(double low, double high, int64_t samples, bool all, int64_t *first, int64_t *count)
+{
+    double last = (double)(samples - 1);
+    *first = all ? 0 : (int64_t)floor(fmin(fmax(low, 0), last));
+    *count = all ? samples : (int64_t)floor(fmin(fmax(high, 0), last)) - *first + 1;
+    *count += *first + *count < samples;
+}
+
+static tl_status sheet_read(const scene_field_map *map, fbm_window window, sheet *out, tl_error *error)
+{
+    const tl_source_info *info = &map->source->info;
+    double low[2] = {HUGE_VAL, HUGE_VAL}, high[2] = {-HUGE_VAL, -HUGE_VAL};
+    const int64_t right = window.i + (int64_t)window.width - 1, below = window.j + (int64_t)window.height - 1;
+    bool turned = map->turn && (window.i < 0 || right >= map->turn);
+    for (int corner = 0; corner < 4; corner++) {
+        double i = turned ? (corner & 1 ? (double)map->turn : 0) : (double)(corner & 1 ? right : window.i);
+        double j = (double)(corner & 2 ? below : window.j);
+        for (int axis = 0; axis < 2; axis++) {
+            double at = position(map->to + 3 * axis, i, j);
+            low[axis] = fmin(low[axis], at);
+            high[axis] = fmax(high[axis], at);
+        }
+    }
+    span(low[0], high[0], info->width, info->wraps, &out->window.x, &out->window.width);
+    span(low[1], high[1], info->height, false, &out->window.y, &out->window.height);
+    out->numbers = tl_alloc_grid(out->window.width, out->window.height, sizeof *out->numbers);
+    if (!out->numbers)
+        return tl_fail_memory(error, info->name);
+    tl_status status = tl_source_read(map->source, info->level, out->window, out->numbers, error);
+    for (int64_t k = 0; status == TL_OK && k < out->window.width * out->window.height; k++)
+        if (isnan(out->numbers[k]))
+            out->numbers[k] = (float)map->fallback;
+    return status;
+}
+
+/* The samples before and after a position, and how far it is from the first to the second. */
+static double neighbours(double at, int64_t samples, bool wraps, int64_t out[2])
+{
+    if (wraps)
+        at -= floor(at / (double)samples) * (double)samples;
+    double limited = fmin(fmax(at, 0), wraps ? (double)samples : (double)(samples - 1)), whole = floor(limited);
+    out[0] = (int64_t)whole;
+    out[1] = out[0] + (limited > whole);
+    for (int k = 0; k < 2 && wraps; k++)
+        out[k] %= samples;
+    return limited - whole;
+}
+
+static float number_at(const scene_field_map *map, const sheet *s, double u, double v)
+{
+    const tl_source_info *info = &map->source->info;
+    int64_t x[2], y[2];
+    double across = neighbours(u, info->width, info->wraps, x), down = neighbours(v, info->height, false, y), rows[2];
+    for (int k = 0; k < 2; k++) {
+        const float *row = s->numbers + (y[k] - s->window.y) * s->window.width - s->window.x;
+        rows[k] = (double)row[x[0]] + across * ((double)row[x[1]] - (double)row[x[0]]);
+    }
+    return (float)(rows[0] + down * (rows[1] - rows[0]));
+}
+
+tl_status scene_field_map_read(const scene_field_map *map, fbm_window window, float *out, tl_error *error)
+{
+    if (!map->source) {
+        for (size_t k = 0; k < window.width * window.height; k++)
+            out[k] = (float)map->fallback;
+        return TL_OK;
+    }
+    sheet s = {.numbers = NULL};
+    tl_status status = sheet_read(map, window, &s, error);
+    for (size_t y = 0; status == TL_OK && y < window.height; y++)
+        for (size_t x = 0; x < window.width; x++) {
+            double i = column_of(map, window.i + (int64_t)x), j = (double)(window.j + (int64_t)y);
+            *out++ = number_at(map, &s, position(map->to, i, j), position(map->to + 3, i, j));
+        }
+    free(s.numbers);
+    return status;
+}

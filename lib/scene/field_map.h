@@ -1,0 +1,25 @@
+/* A raster of numbers that go with the samples of an elevation model, on a lattice of its own. */
+#ifndef SCENE_FIELD_MAP_H
+#define SCENE_FIELD_MAP_H
+
+#include "fbm/window.h"
+#include "lib/talus.h"
+
+typedef struct scene_field_map {
+    const tl_source *source; /* NULL: none, `fallback` everywhere */
+    double to[6];    /* sample (i, j) of the model lies at (to[0] + to[1] i + to[2] j, to[3] + ...) of the map */
+    int64_t turn;    /* columns of the model after which they come again; 0: they do not */
+    double fallback; /* where the map is void */
+    double least;    /* of its numbers and `fallback` */
+} scene_field_map;
+
+/* Lays a map over a model: by place where both are located, which must be in one CRS (as far as that is known); else
+ * it covers the model from edge to edge. Every number must be from `low` to `high`, for which the map is read once.
+ * `what`: "Hurst exponents", for messages. `map` NULL: none. */
+tl_status scene_field_map_open(const tl_source *map, const tl_source_info *model, const char *what, double low,
+                               double high, double fallback, const tl_run *run, scene_field_map *out, tl_error *error);
+/* Numbers at a window of the model's samples, which may reach beyond it, without gaps: bilinear between the map's
+ * samples, beyond them as at its rim. */
+tl_status scene_field_map_read(const scene_field_map *map, fbm_window window, float *out, tl_error *error);
+
+#endif
