@@ -103,8 +103,9 @@ tl_status lod_ground_open(const common *shared, lod_options *o, const arguments 
     if (!dem)
         return error->status;
     tl_pyramid_options errors = {.frame = frame, .run = run};
+    const tl_write_options writing = {.frame = frame};
     if (output)
-        errors.rounding = tl_write_rounding(&dem->info, output, frame);
+        errors.rounding = tl_write_rounding(&dem->info, output, &writing);
     out->pyramid = make_pyramid(shared, o->error_cache, dem, &errors, error);
     o->field.run = run;
     out->field = out->pyramid ? tl_field_create(dem, &o->field, error) : NULL;
