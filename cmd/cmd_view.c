@@ -1,5 +1,6 @@
 #include "cmd/command.h"
 #include "cmd/lod_options.h"
+#include "cmd/picture_options.h"
 #include "cmd/view_options.h"
 
 #include <stdio.h>
@@ -11,16 +12,23 @@ typedef struct settings {
     common common;
     view_options view;
     lod_options lod;
+    picture_options picture;
     int frame;
-    bool json;
+    bool json, measure;
 } settings;
+
+/* What the command is about, in messages. */
+static const char *name_of(const settings *set)
+{
+    return set->common.output ? set->common.output : set->picture.picture ? set->picture.picture : "view";
+}
 
 static void report(const settings *set, const tl_lod_stats *s, double seconds)
 {
     command_say(&set->common,
                 "%s: %llu triangles, %llu vertices, finest level %d, error <= %.3g pixels; %llu tiles of %llu samples "
                 "made, %llu blocks of the DEM read; %.2f s, of which %.2f s for the view",
-                set->common.output, (unsigned long long)s->triangles, (unsigned long long)s->vertices, s->finest_level,
+                name_of(set), (unsigned long long)s->triangles, (unsigned long long)s->vertices, s->finest_level,
                 s->pixel_error, (unsigned long long)s->tiles_made, (unsigned long long)s->samples_made,
                 (unsigned long long)s->dem_blocks, seconds, s->seconds);
     command_say(&set->common,
@@ -30,13 +38,48 @@ static void report(const settings *set, const tl_lod_stats *s, double seconds)
                 (unsigned long long)s->culled[3]);
 }
 
-static int print_json(const tl_lod_stats *stats)
+static int print_json(const tl_lod_stats *stats, const tl_view_report *measured)
 {
     json_t *root = lod_stats_json(stats);
+    if (measured)
+        json_object_set_new(root, "measured", view_report_json(measured));
     if (json_dumpf(root, stdout, JSON_INDENT(2)) == 0)
         putchar('\n');
     json_decref(root);
     return command_done();
+}
+
+/* The mesh, the picture, or both. */
+static tl_status write_outputs(const settings *set, const tl_mesh *mesh, const tl_source *dem, const tl_view *view,
+                               const tl_run *run, tl_error *error)
+{
+    const tl_write_options writing = {.overwrite = set->common.overwrite, .frame = (tl_frame)set->frame, .run = run};
+    tl_view_picture_options look = set->picture.look;
+    look.overwrite = set->common.overwrite;
+    look.run = run;
+    tl_status status = TL_OK;
+    if (set->common.output)
+        status = tl_write_mesh(mesh, set->common.output, &writing, error);
+    if (status == TL_OK && set->picture.picture)
+        status = tl_view_write_picture(mesh, dem, view, 1, set->picture.picture, &look, error);
+    return status;
+}
+
+/* Beside the same view of the same field, refined until a quarter of the error is left, and a quarter of a pixel. */
+static tl_status measure(const settings *set, const lod_ground *ground, const tl_mesh *mesh, const tl_view *view,
+                         const tl_run *run, tl_view_report *out, tl_error *error)
+{
+    double asked = set->lod.lod.pixel_error > 0 ? set->lod.lod.pixel_error : 1;
+    const tl_lod_options finer = {
+        .pixel_error = asked < 1 ? asked / 4 : 0.25, .keep = set->lod.lod.keep, .run = set->lod.lod.run};
+    tl_mesh *reference = NULL;
+    tl_lod_stats stats;
+    tl_status status =
+        tl_select(ground->field, ground->opened.source, ground->pyramid, view, &finer, &reference, &stats, error);
+    if (status == TL_OK)
+        status = tl_view_measure(mesh, reference, ground->opened.source, view, run, out, error);
+    tl_mesh_destroy(reference);
+    return status;
 }
 
 static int write_view(const settings *set, const lod_ground *ground, const tl_run *run, progress *bar)
@@ -45,7 +88,7 @@ static int write_view(const settings *set, const lod_ground *ground, const tl_ru
     tl_view view;
     tl_mesh *mesh = NULL;
     tl_lod_stats stats;
-    const tl_write_options writing = {.overwrite = set->common.overwrite, .frame = (tl_frame)set->frame, .run = run};
+    tl_view_report measured;
     progress_stage(bar, "selecting");
     tl_status status = view_options_view(&set->view, &view, &error);
     if (status == TL_OK)
@@ -53,12 +96,22 @@ static int write_view(const settings *set, const lod_ground *ground, const tl_ru
                            &error);
     progress_stage(bar, "writing");
     if (status == TL_OK)
-        status = tl_write_mesh(mesh, set->common.output, &writing, &error);
+        status = write_outputs(set, mesh, ground->opened.source, &view, run, &error);
+    double seconds = progress_end(bar);
+    if (status == TL_OK && set->measure) {
+        progress_stage(bar, "measuring the picture");
+        status = measure(set, ground, mesh, &view, run, &measured, &error);
+    }
     tl_mesh_destroy(mesh);
     if (status != TL_OK)
         return command_failed(bar, &error);
-    report(set, &stats, progress_end(bar));
-    return set->json ? print_json(&stats) : EXIT_DONE;
+    report(set, &stats, seconds);
+    if (set->measure) {
+        char text[VIEW_REPORT_TEXT];
+        view_report_text(&measured, text, sizeof text);
+        command_say(&set->common, "measured: %s", text);
+    }
+    return set->json ? print_json(&stats, set->measure ? &measured : NULL) : EXIT_DONE;
 }
 
 static int view(settings *set, const arguments *inputs)
@@ -68,10 +121,12 @@ static int view(settings *set, const arguments *inputs)
     tl_run run = command_run(&set->common, &bar);
     lod_ground ground;
     struct stat there; /* told before the work; tl_write_mesh looks again */
-    if (!set->common.overwrite && lstat(set->common.output, &there) == 0) {
-        complain("%s: exists already; name another file or give --overwrite", set->common.output);
-        return EXIT_FAILED;
-    }
+    const char *const outputs[] = {set->common.output, set->picture.picture, set->picture.look.depth};
+    for (int k = 0; k < 3; k++)
+        if (outputs[k] && !set->common.overwrite && lstat(outputs[k], &there) == 0) {
+            complain("%s: exists already; name another file or give --overwrite", outputs[k]);
+            return EXIT_FAILED;
+        }
     progress_stage(&bar, "measuring");
     if (lod_ground_open(&set->common, &set->lod, inputs, (tl_frame)set->frame, set->common.output, &run, &ground,
                         &error) != TL_OK)
@@ -87,6 +142,10 @@ static int run(const command *self, int argc, const char **argv, bool help)
     const option place[] = {VIEW_OPTIONS(set.view), {0}};
     const option depth[] = {LOD_OPTIONS(set.lod), {0}};
     const option detail[] = {DETAIL_OPTIONS(set.lod), {0}};
+    const option picture[] = {PICTURE_OPTIONS(set.picture),
+                              {"measure", 0, OPTION_FLAG, &set.measure, NULL, NULL,
+                               "compare the picture with that of the field refined four times as far", 0, 0, NULL},
+                              {0}};
     const option input[] = {COMMON_INPUT(set.common), {0}};
     const option output[] = {COMMON_OUTPUT(set.common),
                              {"frame", 0, OPTION_CHOICE, &set.frame, NULL, "FRAME",
@@ -94,18 +153,15 @@ static int run(const command *self, int argc, const char **argv, bool help)
                              {"json", 0, OPTION_FLAG, &set.json, NULL, NULL, "print statistics as JSON", 0, 0, NULL},
                              {0}};
     const option running[] = {COMMON_RUNNING(set.common), {0}};
-    const option_group groups[] = {{"View", place},
-                                   {"Depth", depth},
-                                   {"Detail", detail},
-                                   {"Input", input},
-                                   {"Output", output},
-                                   {"Running", running},
-                                   {0}};
+    const option_group groups[] = {{"View", place},  {"Depth", depth},   {"Detail", detail},   {"Picture", picture},
+                                   {"Input", input}, {"Output", output}, {"Running", running}, {0}};
     arguments rest;
     int status;
     if (!command_begin(self, argc, argv, help, groups, -1, &rest, &status))
         return status;
-    bool good = view_options_ok(&set.view) && lod_options_ok(&set.lod) && command_output_ok(&set.common, false, true);
+    bool mesh = set.common.output || !(set.picture.picture || set.measure);
+    bool good = view_options_ok(&set.view) && lod_options_ok(&set.lod) && picture_options_ok(&set.picture) &&
+                (!mesh || command_output_ok(&set.common, false, true));
     status = good ? view(&set, &rest) : EXIT_USAGE;
     arguments_free(&rest);
     return status;

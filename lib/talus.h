@@ -759,7 +759,8 @@ typedef struct tl_lod_options {
 
 typedef struct tl_lod_stats {
     uint64_t triangles, vertices;
-    uint64_t visited, split;         /* nodes of the hierarchy */
+    uint64_t visited, split;         /* nodes of the hierarchy; of tl_roam those that were looked at again, and split */
+    uint64_t merged;                 /* of tl_roam: nodes that are not split any more */
     uint64_t culled[4];              /* nodes, by rule: frustum, back, horizon, ridge */
     uint64_t tiles_made, tiles_used; /* tiles of the field that were synthesised, and times one was asked for */
     uint64_t samples_made;
@@ -774,6 +775,21 @@ typedef struct tl_lod_stats {
  * field's finest level; the mesh has no cracks, and nothing where it was culled. */
 TL_API tl_status tl_select(const tl_source *field, const tl_source *dem, const tl_pyramid *pyramid, const tl_view *view,
                            const tl_lod_options *options, tl_mesh **out, tl_lod_stats *stats, tl_error *error);
+
+/* Triangles that are kept from view to view: a flight costs what changes. The triangles for a view are those of
+ * tl_select, whatever was looked at before. */
+typedef struct tl_roam tl_roam;
+
+/* As tl_select; options->selector does not matter, and options->run is copied. Borrows the three. */
+TL_API tl_roam *tl_roam_create(const tl_source *field, const tl_source *dem, const tl_pyramid *pyramid,
+                               const tl_lod_options *options, tl_error *error);
+/* Looks from another view. Of the statistics, `seconds` are those of choosing the triangles, `vertices` are all that are
+ * kept, and `pixel_error` is by what was found when a triangle was last looked at. After a failure only the destroyer
+ * is left. `stats` may be NULL. */
+TL_API tl_status tl_roam_look(tl_roam *roam, const tl_view *view, tl_lod_stats *stats, tl_error *error);
+/* The mesh for the last view. */
+TL_API tl_status tl_roam_mesh(tl_roam *roam, tl_mesh **out, tl_error *error);
+TL_API void tl_roam_destroy(tl_roam *roam);
 
 /* How tl_view_write_picture draws. */
 typedef struct tl_view_picture_options {
@@ -816,9 +832,10 @@ typedef struct tl_view_report {
  * column and row of the lattice (both as the flat triangles have it there): how far the picture of a piece of ground is
  * shifted, whether or not the mesh's own relief then hides it. *Silhouettes* are what parallax leaves out: with 4 x 4
  * samples a pixel, at every sample beside an edge of the reference's picture (one of its four neighbours is nearer or
- * farther ahead by more than a tenth, or sky), the distance to the nearest sample where the mesh's picture is as near, to
- * a tenth, or sky as well; and the same from the edges of the mesh's picture to that of the reference. It comes in steps
- * of a quarter of a pixel; 4 stands for 4 or more. Takes 28 bytes a triangle of either mesh. */
+ * farther ahead by more than a tenth, or sky), how far around it one must look in the mesh's picture to see something as
+ * near and something as far, to a tenth (sky is farthest): how far the edge is shifted. And the same from the edges of
+ * the mesh's picture to that of the reference. It comes in steps of a quarter of a pixel; 4 stands for 4 or more. Takes
+ * some 70 bytes a triangle of the mesh and 16 of the reference. */
 TL_API tl_status tl_view_measure(const tl_mesh *mesh, const tl_mesh *reference, const tl_source *dem,
                                  const tl_view *view, const tl_run *run, tl_view_report *out, tl_error *error);
 

@@ -261,24 +261,36 @@ static bool is_edge(const sheet *s, const float *picture, int width, int x, int 
            (y > 0 && !alike(*at, at[-width])) || (y < s->rows - 1 && !alike(*at, at[width]));
 }
 
-/* The distance, in samples, to the nearest sample of the other picture that is alike. Between samples one is as near as
- * the nearer, and as far as the farther: a slope that is seen at a grazing angle may skip the distance that is looked
- * for. */
-static double nearest_alike(const sheet *s, const float *other, float wanted, int width, int x, int y)
+/* Squared distance, in samples, to the nearest sample of a picture that is not farther (`nearer`) or not nearer than
+ * wanted; at most REACH^2. */
+static int nearest_such(const sheet *s, const float *picture, double wanted, bool nearer, int width, int x, int y)
 {
     int best = REACH * REACH;
+    double sign = nearer ? 1 : -1, limit = nearer ? wanted * edge_step : -wanted / edge_step;
     for (int dy = 0; dy * dy < best; dy++)
         for (int side = dy ? -1 : 1; side <= 1; side += 2) {
             int row = y + side * dy;
             if (row < 0 || row >= s->rows)
                 continue;
-            for (int dx = 0; dx * dx + dy * dy < best; dx++) {
-                const float *line = other + (size_t)row * (size_t)width;
-                if ((x + dx < width && alike(wanted, line[x + dx])) || (x - dx >= 0 && alike(wanted, line[x - dx])))
+            const float *line = picture + (size_t)row * (size_t)width;
+            for (int dx = 0; dx * dx + dy * dy < best; dx++)
+                if ((x + dx < width && sign * (double)line[x + dx] <= limit) ||
+                    (x - dx >= 0 && sign * (double)line[x - dx] <= limit))
                     best = dx * dx + dy * dy;
-            }
         }
-    return sqrt(best);
+    return best;
+}
+
+/* How far around a sample one must look in the other picture to see what is as near, and what is as far: what lies
+ * between them may be hidden by less than that. */
+static double displacement(const sheet *s, const float *other, float wanted, int width, int x, int y)
+{
+    double here = (double)other[(size_t)y * (size_t)width + (size_t)x];
+    if (here <= (double)wanted * edge_step && here >= (double)wanted / edge_step)
+        return 0;
+    int near = nearest_such(s, other, (double)wanted, true, width, x, y),
+        far = nearest_such(s, other, (double)wanted, false, width, x, y);
+    return sqrt(near > far ? near : far);
 }
 
 static void measure_edges(const measuring *m, const sheet *s, int first, int end, unsigned worker)
@@ -289,7 +301,7 @@ static void measure_edges(const measuring *m, const sheet *s, int first, int end
             for (int x = 0; x < m->width; x++) {
                 float here = pictures[k][(size_t)y * (size_t)m->width + (size_t)x];
                 if (is_edge(s, pictures[k], m->width, x, y))
-                    add(&m->silhouette[worker], nearest_alike(s, pictures[!k], here, m->width, x, y) / SAMPLES);
+                    add(&m->silhouette[worker], displacement(s, pictures[!k], here, m->width, x, y) / SAMPLES);
             }
 }
 
