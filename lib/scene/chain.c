@@ -483,12 +483,13 @@ tl_status scene_chain_fit_places(scene_chain *chain, const char *name, tl_error 
 void scene_planes_cut(const scene_planes *planes, fbm_window part, float *const out[SCENE_PLANES])
 {
     const fbm_window *w = &planes->window;
-    assert(part.i >= w->i && part.j >= w->j && part.width <= w->width && part.height <= w->height);
     for (int p = 0; p < SCENE_PLANES; p++)
-        for (size_t row = 0; out[p] && row < part.height; row++)
+        for (size_t row = 0; out[p] && row < part.height; row++) {
+            assert(part.i >= w->i && part.j >= w->j && part.width <= w->width && part.height <= w->height);
             memcpy(out[p] + row * part.width,
                    planes->of[p] + ((size_t)(part.j - w->j) + row) * w->width + (size_t)(part.i - w->i),
                    part.width * sizeof *out[p]);
+        }
 }
 
 const fbm_scheme *scene_scheme(const char *name, tl_error *error)
