@@ -20,6 +20,8 @@ typedef struct settings {
     tl_noise_options noise;
     int64_t levels, seed;
     int compression, mip, frame, support;
+    const char *preset;
+    int64_t tile;
     double quantum; /* step of the heights */
     bool quantum_given;
     bool size_given, hurst_given, delta_given;
@@ -38,18 +40,43 @@ static void report(const settings *set, const tl_source *made, double seconds)
         command_say(&set->common, "  %s: %s", made->info.parameters[i].name, made->info.parameters[i].value);
 }
 
-static tl_status write_grid(const settings *set, const tl_source *made, const tl_run *run, tl_error *error)
+/* Writes what a preset asks for, and tells what to type into its importer. */
+static tl_status write_preset(const settings *set, const tl_source *made, const tl_run *run, tl_error *error)
 {
+    const tl_preset_options options = {
+        .preset = set->preset, .tile = set->tile, .overwrite = set->common.overwrite, .run = run};
+    tl_preset_report report;
+    tl_status status = tl_write_preset(made, set->common.output, &options, &report, error);
+    if (status != TL_OK)
+        return status;
+    command_say(&set->common, "%s: %lld x %lld tiles of %lld x %lld samples, from column %lld, row %lld; %g ... %g",
+                set->preset, (long long)report.columns, (long long)report.rows, (long long)report.tile_width,
+                (long long)report.tile_height, (long long)report.window.x, (long long)report.window.y,
+                (double)report.low, (double)report.high);
+    for (char *rest, *line = strtok_r(report.import, "\n", &rest); line; line = strtok_r(NULL, "\n", &rest))
+        command_say(&set->common, "  %s", line);
+    return TL_OK;
+}
+
+static tl_status write_samples(const settings *set, const tl_source *made, const tl_run *run, tl_error *error)
+{
+    if (set->preset)
+        return write_preset(set, made, run, error);
     const tl_write_options options = {.overwrite = set->common.overwrite,
                                       .validity = set->common.voids && strcmp(set->common.voids, "keep") != 0,
                                       .compression = (tl_compression)set->compression,
                                       .mip = (tl_mip)set->mip,
                                       .frame = (tl_frame)set->frame,
                                       .run = run};
+    return tl_write_grid(made, set->common.output, &options, error);
+}
+
+static tl_status write_grid(const settings *set, const tl_source *made, const tl_run *run, tl_error *error)
+{
     if (!set->quantum_given)
-        return tl_write_grid(made, set->common.output, &options, error);
+        return write_samples(set, made, run, error);
     tl_source *steps = tl_quantized_create(made, set->quantum, error);
-    tl_status status = steps ? tl_write_grid(steps, set->common.output, &options, error) : TL_ERROR_MEMORY;
+    tl_status status = steps ? write_samples(set, steps, run, error) : TL_ERROR_MEMORY;
     tl_source_destroy(steps);
     return status;
 }
@@ -80,6 +107,10 @@ static int write_out(const settings *set, const tl_source *made, const tl_run *r
 /* Whether the output's format holds what is asked for. */
 static bool mip_ok(const settings *set)
 {
+    if (set->tile && !set->preset) {
+        complain("--tile is for --preset; give that too, or leave it away");
+        return false;
+    }
     const tl_format *format = tl_format_of(set->common.output);
     if (!set->mip || (format && strcmp(format->ending, "exr") == 0))
         return true;
@@ -354,6 +385,12 @@ static int run_synth(const command *self, int argc, const char **argv, bool help
                               "round heights to multiples of Q, in the DEM's unit, 1e-30...1e30: smaller files "
                               "(default: as they are)",
                               1e-30, 1e30, NULL},
+                             {"preset", 0, OPTION_TEXT, &set.preset, NULL, "PROGRAM",
+                              "write for unreal, unity, godot, blender or houdini: sizes, names and order of rows, and "
+                              "what to type into its importer",
+                              0, 0, NULL},
+                             {"tile", 0, OPTION_INTEGER, &set.tile, NULL, "N",
+                              "samples on a side of the tiles of a preset (default: chosen)", 1, 65536, NULL},
                              {"mip", 0, OPTION_CHOICE, &set.mip, NULL, "KIND",
                               "coarser levels in an .exr, of every second sample or of means (default: none)", 0, 0,
                               mips},
@@ -387,11 +424,12 @@ static int run_synth(const command *self, int argc, const char **argv, bool help
     return status;
 }
 
-const command command_synth = {
-    "synth", "add fractal detail below the samples of an elevation model", "DEM... [--levels N] -o OUTPUT",
-    INPUT_NOTES "\n\nFormats: .exr, .tif, .png (16 bit, with a .json beside it), .glb, .obj, .ply.\n\n"
-                "Example: talus synth dem.tif --levels 4 --seed 7 -o terrain.exr",
-    run_synth};
+const command command_synth = {"synth", "add fractal detail below the samples of an elevation model",
+                               "DEM... [--levels N] -o OUTPUT",
+                               INPUT_NOTES "\n\nFormats: .exr, .tif, .png, .r16 (16 bit) and .raw (floats), these with "
+                                           "a .json beside them, .glb, .obj, .ply, .stl.\n\n"
+                                           "Example: talus synth dem.tif --levels 4 --seed 7 -o terrain.exr",
+                               run_synth};
 
 /* ---- noise ---- */
 
@@ -430,6 +468,12 @@ static int run_noise(const command *self, int argc, const char **argv, bool help
                               "round heights to multiples of Q, in the DEM's unit, 1e-30...1e30: smaller files "
                               "(default: as they are)",
                               1e-30, 1e30, NULL},
+                             {"preset", 0, OPTION_TEXT, &set.preset, NULL, "PROGRAM",
+                              "write for unreal, unity, godot, blender or houdini: sizes, names and order of rows, and "
+                              "what to type into its importer",
+                              0, 0, NULL},
+                             {"tile", 0, OPTION_INTEGER, &set.tile, NULL, "N",
+                              "samples on a side of the tiles of a preset (default: chosen)", 1, 65536, NULL},
                              {"mip", 0, OPTION_CHOICE, &set.mip, NULL, "KIND",
                               "coarser levels in an .exr, of every second sample or of means (default: none)", 0, 0,
                               mips},
@@ -453,6 +497,7 @@ static int run_noise(const command *self, int argc, const char **argv, bool help
 
 const command command_noise = {"noise", "make a fractional Brownian surface",
                                "[--size N] [--hurst H] [--delta D] -o OUTPUT",
-                               "Formats: .exr, .tif, .png (16 bit, with a .json beside it), .glb, .obj, .ply.\n\n"
+                               "Formats: .exr, .tif, .png, .r16 (16 bit) and .raw (floats), these with a .json beside "
+                               "them, .glb, .obj, .ply, .stl.\n\n"
                                "Example: talus noise --size 2048 --hurst 0.7 -o noise.exr",
                                run_noise};

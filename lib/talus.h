@@ -716,10 +716,10 @@ typedef struct tl_view_key {
 } tl_view_key;
 
 /* Reads views from a camera file: the members of tl_view by their names in a JSON, as {"eye": [11.3, 46.7, 300],
- * "above_ground": true, "heading": 120}; several of them, with "time", as {"views": [...]}, where members beside "views"
- * count for each view that does not say otherwise; or the cameras of a glTF (.gltf, .glb) with the origin that talus
- * writes into the asset's extras: perspective ones, placed by nodes. *keys is freed by free().
- * TL_ERROR_DATA where the file holds no views, or members that are not known. */
+ * "above_ground": true, "heading": 120}; several of them, with "time", as {"views": [...]}, where members beside
+ * "views" count for each view that does not say otherwise; or the cameras of a glTF (.gltf, .glb) with the origin that
+ * talus writes into the asset's extras: perspective ones, placed by nodes. *keys is freed by free(). TL_ERROR_DATA
+ * where the file holds no views, or members that are not known. */
 TL_API tl_status tl_view_path_read(const char *path, tl_view_key **keys, size_t *count, tl_error *error);
 /* The same for a file of one view. */
 TL_API tl_status tl_view_read(const char *path, tl_view *out, tl_error *error);
@@ -795,13 +795,14 @@ TL_API void tl_roam_destroy(tl_roam *roam);
 typedef struct tl_view_picture_options {
     double sun_azimuth, sun_elevation; /* degrees, clockwise from north and above the horizon (0 ... 90), at the eye's
                                           foot; both 0: 315 and 45 */
-    double haze;         /* metres at which half of the light is lost in the air; 0: clear */
-    double exaggeration; /* factor on the mesh's heights, not on the eye's, 0 ... 1e6; 0: 1 */
-    bool grey;           /* no colours by height */
-    bool facets;         /* light each triangle by itself; else by normals at its corners, means over the triangles
-                            around weighted by their areas, so that no triangle shows */
-    const char *depth;   /* also write an EXR of this name: metres ahead of the eye (along the middle of the picture) at
-                            the middle of each pixel, float32, void where nothing is seen; of the first view. NULL: none */
+    double haze;                       /* metres at which half of the light is lost in the air; 0: clear */
+    double exaggeration;               /* factor on the mesh's heights, not on the eye's, 0 ... 1e6; 0: 1 */
+    bool grey;                         /* no colours by height */
+    bool facets; /* light each triangle by itself; else by normals at its corners, means over the triangles
+                    around weighted by their areas, so that no triangle shows */
+    const char
+        *depth; /* also write an EXR of this name: metres ahead of the eye (along the middle of the picture) at
+                   the middle of each pixel, float32, void where nothing is seen; of the first view. NULL: none */
     bool overwrite;
     const tl_run *run;
 } tl_view_picture_options;
@@ -990,10 +991,10 @@ typedef struct tl_write_options {
     const tl_run *run;
 } tl_write_options;
 
-/* Writes the finest level of a source to `path`, in the format of its ending (EXR, GeoTIFF, 16-bit PNG with a
- * JSON file beside it, or a full mesh). EXR and PNG have the north in their first row, whatever the order of the
- * source; GeoTIFF keeps the source's. Tiles are made in parallel and written as they come, so memory does not grow with
- * the output. The file appears under its name only when it is complete. */
+/* Writes the finest level of a source to `path`, in the format of its ending (EXR, GeoTIFF, 16-bit PNG, R16 and raw
+ * floats with a JSON file beside them, or a full mesh). All but GeoTIFF have the north in their first row, whatever the
+ * order of the source; GeoTIFF keeps the source's. Tiles are made in parallel and written as they come, so memory does
+ * not grow with the output. The file appears under its name only when it is complete. */
 TL_API tl_status tl_write_grid(const tl_source *source, const char *path, const tl_write_options *options,
                                tl_error *error);
 /* Writes a mesh to `path` (GLB, OBJ, PLY or STL by its ending). An STL in map coordinates counts from a whole unit near
@@ -1039,6 +1040,41 @@ TL_API tl_status tl_framework_save(const tl_framework *framework, const tl_sourc
 TL_API bool tl_framework_is_file(const char *path);
 /* Reads the framework back: the same points, triangles and bound. TL_ERROR_ARGUMENT where it is none. */
 TL_API tl_framework *tl_framework_load(const char *path, const tl_run *run, tl_error *error);
+
+/* ---- Game engines and modellers ------------------------------------------------------------------- */
+
+/* What a program imports best. */
+typedef struct tl_preset {
+    const char *name;    /* "unreal" */
+    const char *summary; /* one line */
+    const char *endings; /* of files that it takes, the best first, with spaces between: "png r16" */
+} tl_preset;
+
+/* The presets, ended by an entry whose name is NULL. */
+TL_API const tl_preset *tl_presets(void);
+
+typedef struct tl_preset_options {
+    const char *preset; /* a name of tl_presets() */
+    int64_t tile;       /* samples on a side of a tile, one that the program takes; 0: chosen */
+    bool overwrite;
+    const tl_run *run; /* the source is read twice: for the range of heights, and to be written */
+} tl_preset_options;
+
+typedef struct tl_preset_report {
+    int64_t tile_width, tile_height; /* samples */
+    int64_t columns, rows;           /* of tiles; neighbours share their outermost samples */
+    tl_window window;                /* of the source that the tiles cover together, in its middle */
+    float low, high;                 /* of the heights in it */
+    char import[640];                /* what to type into the program's importer, a line each */
+} tl_preset_report;
+
+/* Writes a source for a program: as many whole tiles of a size that it takes as cover most of the source, from its
+ * middle, all over one range of heights, in the order of rows and by the names that the program wants: NAME.r16 for one
+ * tile, NAME_x0_y0.r16 and so on for more; and NAME.json, which tells where they lie and what their numbers mean. Voids
+ * become the lowest height, since no program knows them. TL_ERROR_ARGUMENT where the source is smaller than the
+ * smallest tile. When it fails nothing is left of what was not there before. */
+TL_API tl_status tl_write_preset(const tl_source *source, const char *path, const tl_preset_options *options,
+                                 tl_preset_report *out, tl_error *error);
 
 /* ---- Pictures ---------------------------------------------------------------------------------- */
 

@@ -318,13 +318,118 @@ static void png16IsWithinHalfAStep(void **state)
     fclose(f);
 }
 
+/* The bytes of a file of this size; free them. */
+static unsigned char *load_exactly(const char *path, size_t count)
+{
+    FILE *file = fopen(path, "rb");
+    unsigned char *bytes = malloc(count + 1);
+    assert_non_null(file);
+    assert_int_equal(fread(bytes, 1, count + 1, file), count);
+    fclose(file);
+    return bytes;
+}
+
+static void plainNumbersAreThoseOfTheSidecar(void **state)
+{
+    place *p = *state;
+    write_ok(p->source, in_folder(p, "a.raw"), NULL);
+    unsigned char *raw = load_exactly(p->path, 4 * WIDTH * HEIGHT);
+    assert_memory_equal(raw, p->heights, 4 * WIDTH * HEIGHT); /* tests run on little-endian machines */
+    free(raw);
+    write_ok(p->source, in_folder(p, "b.r16"), NULL);
+    unsigned char *values = load_exactly(p->path, 2 * WIDTH * HEIGHT);
+    json_t *json = json_load_file(in_folder(p, "b.json"), 0, NULL);
+    double scale = json_real_value(json_object_get(json, "scale")),
+           offset = json_real_value(json_object_get(json, "offset"));
+    for (int k = 0; k < WIDTH * HEIGHT; k++) {
+        int value = values[2 * k] | values[2 * k + 1] << 8;
+        assert_int_equal(value == 0, isnan(p->heights[k]) != 0);
+        if (value)
+            assert_near(offset + scale * value, (double)p->heights[k], 0.5 * scale + 1e-9);
+    }
+    json_decref(json);
+    free(values);
+}
+
+/* Unity's tiles: from the middle, the south first, with shared rims and one scale; voids are the lowest height. */
+static void presetsCutAndTurn(void **state)
+{
+    place *p = *state;
+    tl_preset_options options = {.preset = "unity", .tile = 129};
+    tl_preset_report report;
+    tl_error error;
+    if (tl_write_preset(p->source, in_folder(p, "land.r16"), &options, &report, &error) != TL_OK)
+        fail_msg("%s", error.text);
+    assert_int_equal(report.columns, 2);
+    assert_int_equal(report.rows, 2);
+    assert_int_equal(report.window.x, (WIDTH - 257) / 2);
+    assert_int_equal(report.window.y, (HEIGHT - 257) / 2);
+    assert_non_null(strstr(report.import, "Terrain Size X 3840,")); /* 128 cells of 30 m */
+    json_t *json = json_load_file(in_folder(p, "land.json"), 0, NULL);
+    double scale = json_real_value(json_object_get(json, "scale")),
+           offset = json_real_value(json_object_get(json, "offset"));
+    assert_int_equal(json_array_size(json_object_get(json, "tiles")), 4);
+    assert_near(offset, (double)report.low, 0);
+    assert_near(offset + 65535 * scale, (double)report.high, 1e-9);
+    for (int row = 0; row < 2; row++)
+        for (int column = 0; column < 2; column++) {
+            char name[32];
+            snprintf(name, sizeof name, "land_x%d_y%d.r16", column, row);
+            unsigned char *values = load_exactly(in_folder(p, name), 2 * 129 * 129);
+            for (int k = 0; k < 129 * 129; k++) {
+                int x = (int)report.window.x + 128 * column + k % 129;
+                int y = (int)report.window.y + 256 - (128 * row + k / 129); /* from the south */
+                float height = p->heights[y * WIDTH + x];
+                double found = offset + scale * (values[2 * k] | values[2 * k + 1] << 8);
+                assert_near(found, isnan(height) ? (double)report.low : (double)height, 0.5 * scale + 1e-9);
+            }
+            free(values);
+        }
+    json_decref(json);
+    /* a file in the way of the last tile: the others are taken back */
+    assert_int_equal(unlink(in_folder(p, "land_x0_y0.r16")) | unlink(in_folder(p, "land_x1_y0.r16")) |
+                         unlink(in_folder(p, "land_x0_y1.r16")) | unlink(in_folder(p, "land.json")),
+                     0);
+    assert_int_not_equal(tl_write_preset(p->source, in_folder(p, "land.r16"), &options, NULL, &error), TL_OK);
+    assert_non_null(strstr(error.text, "land_x1_y1.r16"));
+    assert_int_equal(access(in_folder(p, "land_x0_y0.r16"), F_OK) & access(in_folder(p, "land.json"), F_OK), -1);
+}
+
+static void presetsRefuseWhatTheirProgramsDo(void **state)
+{
+    place *p = *state;
+    static const struct {
+        const char *preset, *name;
+        int64_t tile;
+        const char *told;
+    } cases[] = {{"unreal", "a.exr", 0, "png r16"},
+                 {"unreal", "a.png", 128, "none of unreal's"},
+                 {"godot", "a.r16", 0, "use more levels"},
+                 {"doom", "a.r16", 0, "no preset 'doom'"},
+                 {"blender", "a.exr", 129, "one file"}};
+    for (size_t k = 0; k < sizeof cases / sizeof *cases; k++) {
+        tl_preset_options options = {.preset = cases[k].preset, .tile = cases[k].tile};
+        tl_error error;
+        assert_int_equal(tl_write_preset(p->source, in_folder(p, cases[k].name), &options, NULL, &error),
+                         TL_ERROR_ARGUMENT);
+        assert_non_null(strstr(error.text, cases[k].told));
+        assert_int_equal(access(p->path, F_OK), -1);
+    }
+    tl_preset_report report;
+    write_ok(p->source, in_folder(p, "a.exr"), NULL);
+    assert_int_equal(
+        tl_write_preset(p->source, in_folder(p, "b.exr"), &(tl_preset_options){.preset = "houdini"}, &report, NULL),
+        TL_OK);
+    assert_non_null(strstr(report.import, "Grid Spacing 30"));
+}
+
 static void constantAndVoidGridsAreWritten(void **state)
 {
     place *p = *state;
-    const char *const names[] = {"a.exr", "a.tif", "a.png", "a.ply", "a.obj"};
+    const char *const names[] = {"a.exr", "a.tif", "a.png", "a.ply", "a.obj", "a.r16", "a.raw"};
     const float values[] = {5, NAN, -0.0f, 1e30f};
     for (size_t v = 0; v < 4; v++)
-        for (size_t k = 0; k < 5; k++) {
+        for (size_t k = 0; k < 7; k++) {
             for (int n = 0; n < WIDTH * HEIGHT; n++)
                 p->heights[n] = values[v];
             write_ok(p->source, in_folder(p, names[k]), &(tl_write_options){.overwrite = true});
@@ -339,8 +444,8 @@ static void constantAndVoidGridsAreWritten(void **state)
 static void threadsDoNotChangeTheBytes(void **state)
 {
     place *p = *state;
-    const char *const names[] = {"a.exr", "a.tif", "a.png", "a.json", "a.ply", "a.obj", "a.glb"};
-    for (size_t k = 0; k < 7; k++) {
+    const char *const names[] = {"a.exr", "a.tif", "a.png", "a.json", "a.ply", "a.obj", "a.glb", "a.r16", "a.raw"};
+    for (size_t k = 0; k < 9; k++) {
         unsigned char *bytes[2];
         size_t size[2];
         for (unsigned n = 0; n < 2; n++) {
@@ -600,6 +705,9 @@ int main(void)
         cmocka_unit_test_setup_teardown(picturesHaveTheNorthOnTop, setUp, tearDown),
         cmocka_unit_test_setup_teardown(validityTravelsBesideTheHeights, setUp, tearDown),
         cmocka_unit_test_setup_teardown(png16IsWithinHalfAStep, setUp, tearDown),
+        cmocka_unit_test_setup_teardown(plainNumbersAreThoseOfTheSidecar, setUp, tearDown),
+        cmocka_unit_test_setup_teardown(presetsCutAndTurn, setUp, tearDown),
+        cmocka_unit_test_setup_teardown(presetsRefuseWhatTheirProgramsDo, setUp, tearDown),
         cmocka_unit_test_setup_teardown(constantAndVoidGridsAreWritten, setUp, tearDown),
         cmocka_unit_test_setup_teardown(threadsDoNotChangeTheBytes, setUp, tearDown),
         cmocka_unit_test_setup_teardown(aFailingSourceLeavesNothing, setUp, tearDown),

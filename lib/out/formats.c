@@ -13,8 +13,8 @@
 typedef tl_status (*grid_writer)(const tl_source *, tl_output *, const tl_write_options *, tl_error *);
 typedef tl_status (*mesh_writer)(const tl_mesh *, tl_output *, const tl_write_options *, tl_error *);
 
-/* One row a format. PNG16 writes two files and opens them itself. A picture is read by its rows, without georeference,
- * so its first row is the north. */
+/* One row a format. Those with a JSON file beside them open both themselves. A picture is read by its rows, without
+ * georeference, so its first row is the north. */
 static const struct writers {
     const char *ending;
     bool picture;
@@ -24,6 +24,7 @@ static const struct writers {
 } writers[] = {
     {"exr", true, out_exr_write, NULL, NULL},       {"tif", false, out_geotiff_write, NULL, NULL},
     {"tiff", false, out_geotiff_write, NULL, NULL}, {"png", true, NULL, NULL, out_png16_write},
+    {"r16", true, NULL, NULL, out_r16_write},       {"raw", true, NULL, NULL, out_raw_write},
     {"glb", false, NULL, out_gltf_write, NULL},     {"obj", false, NULL, out_obj_write, NULL},
     {"ply", false, NULL, out_ply_write, NULL},      {"stl", false, NULL, out_stl_write, NULL},
 };
@@ -34,6 +35,8 @@ static const tl_format formats[] = {
     {"tif", "GeoTIFF, 32-bit float, tiled", true, false},
     {"tiff", "the same", true, false},
     {"png", "16-bit grey PNG over the range of heights, with a JSON file beside it", true, false},
+    {"r16", "unsigned 16-bit values over the range of heights, with a JSON file beside them", true, false},
+    {"raw", "32-bit floats row by row, with a JSON file beside them", true, false},
     {"glb", "glTF 2.0 binary mesh", true, true},
     {"obj", "Wavefront OBJ mesh", true, true},
     {"ply", "binary PLY mesh", true, true},
@@ -62,8 +65,8 @@ static const struct writers *writers_of(const char *path, tl_error *error)
 {
     const tl_format *format = tl_format_of(path);
     if (!format) {
-        tl_fail(error, TL_ERROR_ARGUMENT, "%s: no format has this ending; use one of exr, tif, png, glb, obj, ply, stl",
-                path);
+        tl_fail(error, TL_ERROR_ARGUMENT,
+                "%s: no format has this ending; use one of exr, tif, png, r16, raw, glb, obj, ply, stl", path);
         return NULL;
     }
     const struct writers *found = &writers[format - formats];

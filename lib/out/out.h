@@ -25,8 +25,10 @@ tl_status out_gltf_write(const tl_mesh *mesh, tl_output *output, const tl_write_
 tl_status out_obj_write(const tl_mesh *mesh, tl_output *output, const tl_write_options *options, tl_error *error);
 tl_status out_ply_write(const tl_mesh *mesh, tl_output *output, const tl_write_options *options, tl_error *error);
 tl_status out_stl_write(const tl_mesh *mesh, tl_output *output, const tl_write_options *options, tl_error *error);
-/* Two files, `path` and its JSON sidecar, so this one opens its own outputs. */
+/* Two files, `path` and its JSON sidecar, so these open their own outputs. */
 tl_status out_png16_write(const tl_source *source, const char *path, const tl_write_options *options, tl_error *error);
+tl_status out_r16_write(const tl_source *source, const char *path, const tl_write_options *options, tl_error *error);
+tl_status out_raw_write(const tl_source *source, const char *path, const tl_write_options *options, tl_error *error);
 
 /* Opens an EXR heightfield that out_exr_write wrote. */
 tl_source *out_exr_open(const char *path, tl_error *error);
