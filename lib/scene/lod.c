@@ -71,10 +71,11 @@ static bool find_range(lod *l)
         l->low = range[0] < l->low ? range[0] : l->low;
         l->high = range[1] > l->high ? range[1] : l->high;
     }
-    if (!(l->low <= l->high))
+    bool any = l->low <= l->high;
+    if (!any)
         l->low = l->high = 0;
     l->filling = .5F * l->low + .5F * l->high;
-    return l->low <= l->high;
+    return any;
 }
 
 tl_status lod_init(lod *l, const tl_source *field, const tl_source *dem, const tl_pyramid *pyramid,
@@ -104,7 +105,7 @@ tl_status lod_init(lod *l, const tl_source *field, const tl_source *dem, const t
     l->rules = (TL_CULL_FRUSTUM | TL_CULL_BACK | TL_CULL_HORIZON | TL_CULL_RIDGE) & ~options->keep;
     bool alone = !(options->budget || options->band_count);
     l->pixel_error = options->pixel_error > 0 ? options->pixel_error : alone ? 1 : 0;
-    find_range(l);
+    l->empty = !find_range(l);
     l->tiles = scene_tiles_create(field, dem, l->levels, options->run, error);
     return l->tiles ? TL_OK : TL_ERROR_MEMORY;
 }
@@ -119,7 +120,7 @@ void lod_finish(lod *l)
         free(l->by_depth[depth].items);
 }
 
-static tl_status mark_corners(lod *l, tl_error *error)
+tl_status lod_mark_corners(lod *l, tl_error *error)
 {
     int32_t end = INT32_C(1) << l->lattice_log;
     tl_status status = TL_OK;
@@ -133,7 +134,7 @@ static tl_status mark_corners(lod *l, tl_error *error)
     return status;
 }
 
-tl_status lod_look(lod *l, const scene_view *view, tl_error *error)
+void lod_turn(lod *l, const scene_view *view)
 {
     l->view = view;
     l->camera = scene_view_camera(view);
@@ -142,7 +143,12 @@ tl_status lod_look(lod *l, const scene_view *view, tl_error *error)
     lod_prepare_tests(l);
     lod_ridges_destroy(l->ridges);
     l->ridges = NULL;
-    tl_status status = l->vertices.count ? lod_place(l, 0, error) : mark_corners(l, error);
+}
+
+tl_status lod_look(lod *l, const scene_view *view, tl_error *error)
+{
+    lod_turn(l, view);
+    tl_status status = l->vertices.count ? lod_place(l, 0, error) : lod_mark_corners(l, error);
     if (status == TL_OK && l->rules & TL_CULL_RIDGE)
         status = lod_ridges_create(l, &l->ridges, error);
     return status;
@@ -155,64 +161,90 @@ static tl_status run_selector(lod *l, uint64_t limit, lod_list *leaves, tl_error
     lod_selector *selectors[] = {[TL_SELECTOR_QUADTREE] = lod_quadtree, [TL_SELECTOR_CHUNK] = lod_chunk};
     leaves->count = 0;
     l->overflow = false;
+    l->certain = 0;
     return selectors[l->options->selector](l, limit, leaves, error);
 }
 
-/* One try at a pixel error: whether it stays within the budget. */
-static tl_status try_error(lod *l, double pixel_error, lod_list *leaves, bool *fits, tl_error *error)
+typedef struct trial {
+    lod *l;
+    lod_list *leaves;
+} trial;
+
+/* One try at a pixel error, from nothing. */
+static tl_status try_error(void *context, double pixel_error, bool *fits, tl_error *error)
 {
+    trial *self = context;
+    lod *l = self->l;
     uint64_t triangles = 0;
     lod_clear(l);
-    tl_lod_stats before = l->stats;
-    before.pixel_error = 0;
-    l->stats = before;
-    l->pixel_error = pixel_error;
-    tl_status status = mark_corners(l, error);
+    l->stats.pixel_error = 0;
+    lod_allow(l, pixel_error);
+    tl_status status = lod_mark_corners(l, error);
     if (status == TL_OK)
-        status = run_selector(l, l->options->budget, leaves, error);
+        status = run_selector(l, l->options->budget, self->leaves, error);
     if (status == TL_OK && !l->overflow)
-        status = lod_count(l, leaves->items, leaves->count, &triangles, error);
+        status = lod_count(l, self->leaves->items, self->leaves->count, &triangles, error);
     *fits = !l->overflow && triangles <= l->options->budget;
     return status;
 }
 
-static tl_status budget_too_small(const lod *l, tl_error *error)
+enum { STEPS = 64, LEAST = -30 * STEPS, LARGEST = 40 * STEPS };
+
+static double error_at(int k, double least)
 {
-    return tl_fail(error, TL_ERROR_ARGUMENT,
-                   "%s: a budget of %llu triangles is less than the view's coarsest surface, with its rim and voids, "
-                   "takes; allow more",
-                   l->dem->info.name, (unsigned long long)l->options->budget);
+    return fmax(exp2((double)k / STEPS), least);
 }
 
-/* The smallest pixel error, to a hundredth, that stays within the budget. */
-static tl_status select_by_budget(lod *l, lod_list *leaves, tl_error *error)
+/* Goes from `at` upwards until it fits, or downwards until it does not, by larger and larger steps. */
+static tl_status bracket(double least, int first, int step, int *good, int *bad, int *last, lod_try *try, void *context,
+                         tl_error *error)
 {
-    const double least = fmax(l->pixel_error, 1e-9), largest = 1e12, step = 8, close = 1.01;
-    double good = fmax(least, 16), bad = 0;
     bool fits;
-    tl_status status = try_error(l, good, leaves, &fits, error);
-    while (status == TL_OK && !fits && good < largest) {
-        bad = good;
-        good = good * step;
-        status = try_error(l, good, leaves, &fits, error);
+    int k = *last;
+    tl_status status = try(context, error_at(k, least), &fits, error);
+    bool up = !fits;
+    *good = LARGEST + 1, *bad = first - 1;
+    while (status == TL_OK) {
+        *(fits ? good : bad) = k;
+        *last = k;
+        if (fits == up || (fits && k == first) || (!fits && k == LARGEST))
+            break;
+        k = up ? (k + step < LARGEST ? k + step : LARGEST) : (k - step > first ? k - step : first);
+        step *= 2;
+        status = try(context, error_at(k, least), &fits, error);
     }
-    if (status == TL_OK && !fits)
-        return budget_too_small(l, error);
-    while (status == TL_OK && !(bad > 0) && good > least) {
-        double next = fmax(good / step, least);
-        status = try_error(l, next, leaves, &fits, error);
-        *(fits ? &good : &bad) = next;
-    }
-    double last = fits ? good : 0;
-    while (status == TL_OK && bad > 0 && good > close * bad) {
-        last = sqrt(good * bad);
-        status = try_error(l, last, leaves, &fits, error);
+    return status;
+}
+
+tl_status lod_search_budget(const lod *l, double least, int step, int *at, lod_try *try, void *context, tl_error *error)
+{
+    int first = least > 0 ? (int)floor(STEPS * log2(fmin(fmax(least, exp2(-30)), exp2(39)))) : LEAST, good, bad;
+    int last = *at < first ? first : *at;
+    tl_status status = bracket(least, first, step, &good, &bad, &last, try, context, error);
+    while (status == TL_OK && good <= LARGEST && good - bad > 1) {
+        bool fits;
+        last = bad + (good - bad) / 2;
+        status = try(context, error_at(last, least), &fits, error);
         *(fits ? &good : &bad) = last;
     }
-    return status == TL_OK && last != good ? try_error(l, good, leaves, &fits, error) : status;
+    if (status == TL_OK && good > LARGEST)
+        return tl_fail(error, TL_ERROR_ARGUMENT,
+                       "%s: a budget of %llu triangles is less than the view's coarsest surface, with its rim and "
+                       "voids, takes; allow more",
+                       l->dem->info.name, (unsigned long long)l->options->budget);
+    bool fits;
+    *at = good;
+    return status == TL_OK && last != good ? try(context, error_at(good, least), &fits, error) : status;
 }
 
-static tl_status describe(const lod *l, const tl_view *view, tl_mesh *mesh, tl_error *error)
+static tl_status select_by_budget(lod *l, lod_list *leaves, tl_error *error)
+{
+    trial self = {l, leaves};
+    int at = LOD_BUDGET_START;
+    return lod_search_budget(l, l->pixel_error, STEPS, &at, try_error, &self, error);
+}
+
+tl_status lod_describe(const lod *l, const tl_view *view, tl_mesh *mesh, tl_error *error)
 {
     static const char *const names[] = {"quadtree", "chunk", "roam"};
     char error_text[TL_NUMBER_TEXT], eye[3 * TL_NUMBER_TEXT], number[3][TL_NUMBER_TEXT];
@@ -236,12 +268,10 @@ static int finest_of(const lod *l)
     return l->levels - l->lattice_log;
 }
 
-static void fill_stats(lod *l, const tl_mesh *mesh, tl_lod_stats *out)
+void lod_fill_stats(const lod *l, tl_lod_stats *out)
 {
     scene_tile_counts counts = scene_tiles_counts(l->tiles);
     *out = l->stats;
-    out->triangles = mesh->triangle_count;
-    out->vertices = mesh->vertex_count;
     out->tiles_made = counts.tiles_made;
     out->tiles_used = counts.tiles_used;
     out->samples_made = counts.samples_made;
@@ -250,7 +280,7 @@ static void fill_stats(lod *l, const tl_mesh *mesh, tl_lod_stats *out)
     out->finest_level = finest_of(l);
 }
 
-static double now(void)
+double lod_now(void)
 {
     struct timespec t;
     clock_gettime(CLOCK_MONOTONIC, &t);
@@ -265,7 +295,7 @@ static tl_status select_triangles(lod *l, const tl_view *view, tl_mesh **out, tl
     if (status == TL_OK)
         status = lod_draw(l, leaves.items, leaves.count, &mesh, error);
     if (status == TL_OK)
-        status = describe(l, view, mesh, error);
+        status = lod_describe(l, view, mesh, error);
     free(leaves.items);
     if (status == TL_OK)
         *out = mesh;
@@ -274,30 +304,52 @@ static tl_status select_triangles(lod *l, const tl_view *view, tl_mesh **out, tl
     return status;
 }
 
+/* A mesh of nothing, over a raster without cells. */
+static tl_status select_nothing(const lod *l, tl_mesh **out, tl_error *error)
+{
+    *out = tl_mesh_create(0, 0, &l->field->info, error);
+    return *out ? TL_OK : TL_ERROR_MEMORY;
+}
+
+static tl_status select_from(lod *l, const tl_view *view, tl_mesh **out, tl_error *error)
+{
+    scene_view *from = scene_view_create(view, l->dem, error);
+    if (!from)
+        return TL_ERROR_ARGUMENT;
+    scene_view_know_ground(from, (double)l->low, false); /* lod_ridges.c knows where the voids are */
+    tl_status status = TL_OK;
+    if (l->empty)
+        status = select_nothing(l, out, error);
+    else {
+        status = lod_look(l, from, error);
+        if (status == TL_OK)
+            status = select_triangles(l, view, out, error);
+    }
+    scene_view_destroy(from);
+    return status;
+}
+
 tl_status tl_select(const tl_source *field, const tl_source *dem, const tl_pyramid *pyramid, const tl_view *view,
                     const tl_lod_options *options, tl_mesh **out, tl_lod_stats *stats, tl_error *error)
 {
     static const tl_lod_options defaults;
-    double start = now();
+    options = options ? options : &defaults;
+    if (options->selector == TL_SELECTOR_ROAM)
+        return lod_roam_once(field, dem, pyramid, view, options, out, stats, error);
+    double start = lod_now();
     lod l;
     tl_mesh *mesh = NULL;
-    tl_status status = lod_init(&l, field, dem, pyramid, options ? options : &defaults, error);
-    scene_view *from = status == TL_OK ? scene_view_create(view, dem, error) : NULL;
-    if (status == TL_OK && !from)
-        status = TL_ERROR_ARGUMENT;
-    if (status == TL_OK) {
-        scene_view_know_ground(from, (double)l.low, false); /* lod_ridges.c knows where the voids are */
-        status = lod_look(&l, from, error);
-    }
+    tl_status status = lod_init(&l, field, dem, pyramid, options, error);
     if (status == TL_OK)
-        status = select_triangles(&l, view, &mesh, error);
+        status = select_from(&l, view, &mesh, error);
     if (status == TL_OK && stats) {
-        fill_stats(&l, mesh, stats);
-        stats->seconds = now() - start;
+        lod_fill_stats(&l, stats);
+        stats->triangles = mesh->triangle_count;
+        stats->vertices = mesh->vertex_count;
+        stats->seconds = lod_now() - start;
     }
     if (status == TL_OK)
         *out = mesh;
-    scene_view_destroy(from);
     lod_finish(&l);
     return status;
 }

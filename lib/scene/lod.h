@@ -49,7 +49,12 @@ typedef struct lod_verdict {
     unsigned char state; /* lod_state */
     unsigned char rule;  /* tl_culling, of a hidden one */
     signed char step;    /* of its chunk: see lod_triangle */
-    float pixels;        /* of its error; infinite where it must be split */
+    float priority;      /* it wants to be split where fewer pixels are allowed; infinite: always, -1: never */
+    /* The verdict stays what it is while the eye has moved by less than `margin`, in metres, where turning by an angle
+     * counts as moving by that times `far`; for an allowed pixel error that stays. Below 0: it may change at any time.
+     */
+    float margin, far;
+    float pixels; /* of its error; infinite where it must be split */
 } lod_verdict;
 
 /* Arrays that grow. */
@@ -83,6 +88,7 @@ typedef struct lod {
     double pixel_error; /* allowed */
     const scene_view *view;
     const scene_camera *camera;
+    double near;         /* pixels by `pixel_error`: errors are too large nearer than this times themselves */
     double planes[5][3]; /* of the frustum, through the eye, inwards, of length 1 */
     scene_tiles *tiles;
     lod_list vertices;               /* lod_vertex */
@@ -93,6 +99,8 @@ typedef struct lod {
     struct lod_ridges *ridges;       /* what ridges hide; NULL: not asked for */
     unsigned rules;                  /* tl_culling that hide */
     bool voids;                      /* the model may have some */
+    bool empty;                      /* the raster has no cells, or no heights */
+    uint64_t certain;                /* leaves that are drawn */
     bool overflow;                   /* a selector stopped at its limit */
     tl_lod_stats stats;
 } lod;
@@ -123,6 +131,8 @@ double lod_residual(const lod *l, const scene_cells *cells);
 double lod_residual_at(const lod *l, const scene_cells *cells, int depth);
 /* Whether triangles of a depth with this error (metres) at this distance are to be split. */
 bool lod_wants(const lod *l, int depth, double error, double distance);
+/* To be called when the allowed pixel error changes. */
+void lod_allow(lod *l, double pixel_error);
 /* The depth from which on triangles lie in one block of scene_tiles. */
 int lod_block_depth(const lod *l);
 /* The vertex that splits a triangle. */
@@ -136,6 +146,7 @@ static inline void lod_middle(const lod *l, const lod_triangle *t, int32_t *x, i
 /* ---- lod_ridges.c: what is behind nearer ground ---- */
 
 typedef struct lod_ridges lod_ridges;
+enum { LOD_RIDGE_LOG = 2 }; /* squares of 4 cells at least: smaller ones have no range of their own */
 /* Goes over the ground from near to far. */
 tl_status lod_ridges_create(lod *l, lod_ridges **out, tl_error *error);
 void lod_ridges_destroy(lod_ridges *ridges);
@@ -162,6 +173,8 @@ static inline const lod_request *lod_asked(const lod *l, size_t index)
 }
 /* Places vertices from `first` on. */
 tl_status lod_place(const lod *l, size_t first, tl_error *error);
+/* Places one. */
+void lod_place_vertex(const lod *l, uint32_t vertex);
 /* Marks what the marked vertices need, from fine to coarse. */
 tl_status lod_close(lod *l, tl_error *error);
 /* Takes all marks away. */
@@ -184,6 +197,21 @@ tl_status lod_draw(lod *l, const lod_leaf *leaves, size_t count, tl_mesh **out, 
 /* Only the number of its triangles. */
 tl_status lod_count(lod *l, const lod_leaf *leaves, size_t count, uint64_t *triangles, tl_error *error);
 
+/* ---- Budgets ---- */
+
+/* Tries pixel errors of a fixed sequence, 2^(k / 64) and the one that was asked for, for the smallest that stays within
+ * the budget, so that it does not depend on where the search begins. `try` sets *fits; the last try is the result. */
+typedef tl_status lod_try(void *context, double pixel_error, bool *fits, tl_error *error);
+tl_status lod_search_budget(const lod *l, double least, int step, int *at, lod_try *try, void *context,
+                            tl_error *error);
+enum { LOD_BUDGET_START = 64 * 4 };
+double lod_now(void); /* seconds */
+void lod_fill_stats(const lod *l, tl_lod_stats *out);
+tl_status lod_describe(const lod *l, const tl_view *view, tl_mesh *mesh, tl_error *error);
+/* Looks from a view, but places no vertices. */
+void lod_turn(lod *l, const scene_view *view);
+tl_status lod_mark_corners(lod *l, tl_error *error);
+
 /* ---- The selectors ---- */
 
 /* Marks the vertices for the pixel error (or bands) of `l`, and lists the leaves (lod_leaf). Stops, when `limit` is not
@@ -191,14 +219,20 @@ tl_status lod_count(lod *l, const lod_leaf *leaves, size_t count, uint64_t *tria
 typedef tl_status lod_selector(lod *l, uint64_t limit, lod_list *leaves, tl_error *error);
 tl_status lod_quadtree(lod *l, uint64_t limit, lod_list *leaves, tl_error *error);
 tl_status lod_chunk(lod *l, uint64_t limit, lod_list *leaves, tl_error *error);
+/* tl_select by roam, which is lod_roam.c. */
+tl_status lod_roam_once(const tl_source *field, const tl_source *dem, const tl_pyramid *pyramid, const tl_view *view,
+                        const tl_lod_options *options, tl_mesh **out, tl_lod_stats *stats, tl_error *error);
 /* Whether the square of 2^log steps of the finest lattice at (x, y) is a chunk that is not divided: the log2 of its
  * step, and the rule that hides it, or 0. */
 bool lod_chunk_says(const struct lod_chunks *chunks, int32_t x, int32_t y, int log, int *step_log, unsigned *hidden);
 
 /* For selectors: adds a leaf, and asks for what its drawing needs. */
 tl_status lod_leave(lod *l, const lod_triangle *t, int depth, lod_list *leaves, tl_error *error);
-/* Finds the blocks of triangles of lod_block_depth. */
-tl_status lod_find_blocks(lod *l, lod_triangle *triangles, size_t count, tl_error *error);
+/* Asks for the block of a triangle of lod_block_depth or more. */
+tl_status lod_want_block(lod *l, lod_triangle *t, tl_error *error);
+/* A cell with one void corner, at the end of its diagonal, is drawn with the other diagonal: by a half of it, a leaf,
+ * and the one on the other side, whose right angle (*x, *y) must be there. False: not this one. */
+bool lod_opposite(const lod *l, const lod_triangle *t, int32_t *x, int32_t *y);
 
 /* The two triangles of depth 0. */
 void lod_roots(const lod *l, lod_triangle out[2]);

@@ -169,20 +169,18 @@ static tl_status count_all(drawing *self, const tl_run *run, uint64_t *count, tl
     return status;
 }
 
-/* Numbers the vertices that triangles have, in their order; the indices become these numbers. */
+/* Numbers the vertices in the order in which triangles have them; the indices become these numbers. */
 static size_t number_vertices(const lod *l, uint32_t *indices, uint64_t triangles, uint32_t *numbers)
 {
-    size_t used = 0;
-    memset(numbers, 0, l->vertices.count * sizeof *numbers);
-    for (uint64_t k = 0; k < 3 * triangles; k++)
-        numbers[indices[k]] = 1;
+    uint32_t used = 0;
     for (size_t k = 0; k < l->vertices.count; k++)
-        if (numbers[k])
-            numbers[k] = (uint32_t)used++;
-        else
-            numbers[k] = LOD_NONE;
-    for (uint64_t k = 0; k < 3 * triangles; k++)
-        indices[k] = numbers[indices[k]];
+        numbers[k] = LOD_NONE;
+    for (uint64_t k = 0; k < 3 * triangles; k++) {
+        uint32_t *number = &numbers[indices[k]];
+        if (*number == LOD_NONE)
+            *number = used++;
+        indices[k] = *number;
+    }
     return used;
 }
 

@@ -62,6 +62,11 @@ static void place(const lod *l, size_t first, size_t count)
             lod_at(l, (uint32_t)(first + k))->at[a] = (float)(xyz[k][a] - l->camera->eye[a]);
 }
 
+void lod_place_vertex(const lod *l, uint32_t vertex)
+{
+    place(l, vertex, 1);
+}
+
 typedef struct placing {
     const lod *l;
     size_t first;

@@ -30,17 +30,12 @@ static tl_status test_item(void *context, tl_parallel *loop, uint64_t item, unsi
     return TL_OK;
 }
 
-tl_status lod_find_blocks(lod *l, lod_triangle *triangles, size_t count, tl_error *error)
+tl_status lod_want_block(lod *l, lod_triangle *t, tl_error *error)
 {
-    tl_status status = TL_OK;
-    for (size_t k = 0; k < count && status == TL_OK; k++) {
-        lod_triangle *t = &triangles[k];
-        int64_t i = tl_int64_min(tl_int64_min(lod_at(l, t->a)->x, lod_at(l, t->b)->x), lod_at(l, t->apex)->x) / l->cell;
-        int64_t j = tl_int64_min(tl_int64_min(lod_at(l, t->a)->y, lod_at(l, t->b)->y), lod_at(l, t->apex)->y) / l->cell;
-        if (i < l->dem->info.width && j < l->dem->info.height)
-            status = scene_tiles_want_block(l->tiles, i, j, &t->block, error);
-    }
-    return status == TL_OK ? scene_tiles_make(l->tiles, l->run, error) : status;
+    const lod_vertex *a = lod_at(l, t->a), *b = lod_at(l, t->b), *apex = lod_at(l, t->apex);
+    int64_t i = tl_int64_min(tl_int64_min(a->x, b->x), apex->x) / l->cell;
+    int64_t j = tl_int64_min(tl_int64_min(a->y, b->y), apex->y) / l->cell;
+    return scene_tiles_want_block(l->tiles, i, j, &t->block, error);
 }
 
 static tl_status test_all(search *self, tl_error *error)
@@ -61,14 +56,12 @@ static int rule_index(unsigned rule)
     return __builtin_ctz(rule);
 }
 
-/* A cell with one void corner, at the end of its diagonal, is drawn with the other diagonal: by this triangle and the
- * one on the other side, whose right angle must be there. */
-static tl_status ask_opposite(lod *l, const lod_triangle *t, tl_error *error)
+bool lod_opposite(const lod *l, const lod_triangle *t, int32_t *x, int32_t *y)
 {
     const lod_vertex *a = lod_at(l, t->a), *b = lod_at(l, t->b), *apex = lod_at(l, t->apex);
-    if (isnan(a->z) == isnan(b->z) || isnan(apex->z))
-        return TL_OK;
-    return lod_ask(l, a->x + b->x - apex->x, a->y + b->y - apex->y, error);
+    *x = a->x + (b->x - apex->x);
+    *y = a->y + (b->y - apex->y);
+    return isnan(a->z) != isnan(b->z) && !isnan(apex->z);
 }
 
 tl_status lod_leave(lod *l, const lod_triangle *t, int depth, lod_list *leaves, tl_error *error)
@@ -76,7 +69,9 @@ tl_status lod_leave(lod *l, const lod_triangle *t, int depth, lod_list *leaves, 
     if (!lod_list_grow(leaves, 1, sizeof(lod_leaf)))
         return tl_fail_memory(error, "the view's triangles");
     ((lod_leaf *)leaves->items)[leaves->count++] = (lod_leaf){*t, depth};
-    return ask_opposite(l, t, error);
+    l->certain += !isnan(lod_at(l, t->a)->z) && !isnan(lod_at(l, t->b)->z) && !isnan(lod_at(l, t->apex)->z);
+    int32_t x, y;
+    return lod_opposite(l, t, &x, &y) ? lod_ask(l, x, y, error) : TL_OK;
 }
 
 /* Sorts the tested triangles into leaves, and those whose middles are asked for, which stay in `current`. */
@@ -152,7 +147,9 @@ static tl_status enter_blocks(search *self, tl_error *error)
             triangles[kept++] = triangles[k];
     }
     self->current.count = kept;
-    return status == TL_OK ? lod_find_blocks(l, triangles, kept, error) : status;
+    for (size_t k = 0; k < kept && status == TL_OK; k++)
+        status = lod_want_block(l, &triangles[k], error);
+    return status == TL_OK ? scene_tiles_make(l->tiles, l->run, error) : status;
 }
 
 static tl_status one_depth(search *self, tl_error *error)
@@ -184,7 +181,7 @@ tl_status lod_quadtree(lod *l, uint64_t limit, lod_list *leaves, tl_error *error
         lod_list done = self.current;
         self.current = self.next;
         self.next = done;
-        l->overflow = limit && leaves->count > limit;
+        l->overflow = limit && l->certain > limit;
         if (l->overflow)
             break;
     }

@@ -7,8 +7,6 @@
 #include <math.h>
 #include <string.h>
 
-enum { LEAST_LOG = 2 }; /* squares of 4 cells: smaller ones have no range of their own */
-
 /* Squares are divided until they look so small, radians. */
 static const double SMALL = .03;
 /* Blocks are read together up to so many times the distance of the nearest. */
@@ -210,8 +208,8 @@ static tl_status go_over_batch(sweep *self, size_t first, size_t end, tl_error *
     self->fine.count = 0;
     for (size_t k = first; k < end && status == TL_OK; k++)
         if (squares[k].log >= 0)
-            status =
-                divide(self, squares[k], squares[k].block == LOD_NONE ? squares[k].log : LEAST_LOG, &self->fine, error);
+            status = divide(self, squares[k], squares[k].block == LOD_NONE ? squares[k].log : LOD_RIDGE_LOG,
+                            &self->fine, error);
     sort(&self->fine);
     for (size_t k = 0; k < self->fine.count && status == TL_OK; k++) {
         const square *s = (const square *)self->fine.items + k;

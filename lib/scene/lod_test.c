@@ -109,6 +109,7 @@ void lod_prepare_tests(lod *l)
 {
     find_spreads(l);
     find_planes(l);
+    lod_allow(l, l->pixel_error);
 }
 
 /* ---- One triangle ---- */
@@ -228,6 +229,7 @@ static void find_error(const lod *l, subject *s, int64_t i, int64_t j)
     if (!(own < HUGE_VAL))
         reach_by_range(l, s);
 }
+
 static subject subject_of(const lod *l, const lod_triangle *t, int depth)
 {
     subject s = {.v = {lod_at(l, t->a), lod_at(l, t->b), lod_at(l, t->apex)}, .depth = depth, .block = t->block};
@@ -247,18 +249,22 @@ static subject subject_of(const lod *l, const lod_triangle *t, int depth)
 /* Where it is, and how near. */
 typedef struct sight {
     double distance;
-    unsigned hidden; /* tl_culling */
+    unsigned hidden;    /* tl_culling */
+    double margin, far; /* as in lod_verdict, of being hidden or not */
 } sight;
 
-/* Beside the screen, by a ball around it. */
-static bool beside(const lod *l, const double middle[3], double radius)
+/* Beside the screen, by a ball around it. *margin: how far from changing. */
+static bool beside(const lod *l, const double middle[3], double radius, double *margin)
 {
+    double inside = HUGE_VAL, outside = -HUGE_VAL;
     for (int k = 0; k < 5; k++) {
         const double *n = l->planes[k];
-        if (n[0] * middle[0] + n[1] * middle[1] + n[2] * middle[2] < -radius)
-            return true;
+        double d = n[0] * middle[0] + n[1] * middle[1] + n[2] * middle[2] + radius;
+        inside = fmin(inside, d);
+        outside = fmax(outside, -d);
     }
-    return false;
+    *margin = inside < 0 ? outside : inside;
+    return inside < 0;
 }
 
 static double steepness(const lod *l, const subject *s)
@@ -285,7 +291,7 @@ static sight look_at_box(const lod *l, const subject *s, unsigned rules)
 {
     scene_extent extent = extent_of(l, s);
     scene_box box;
-    sight out = {0, 0};
+    sight out = {.margin = -1};
     scene_view_box(l->view, &extent, &box);
     out.hidden = scene_view_hides(l->view, &extent, &box, steepness(l, s),
                                   rules & (TL_CULL_FRUSTUM | TL_CULL_BACK | TL_CULL_HORIZON));
@@ -293,11 +299,16 @@ static sight look_at_box(const lod *l, const subject *s, unsigned rules)
     return out;
 }
 
+/* Ridges hide squares of some sizes. */
+static bool may_be_behind(const lod *l, const subject *s)
+{
+    return !(s->depth & 1) && stage_of(l, s->depth) + 1 - l->levels >= LOD_RIDGE_LOG;
+}
+
 static bool behind_ridge(const lod *l, const subject *s)
 {
-    int log = stage_of(l, s->depth) + 1 - l->levels;
-    return l->ridges && !(s->depth & 1) && log >= 0 &&
-           lod_ridges_hide(l->ridges, s->at.x0 / l->cell, s->at.y0 / l->cell, log);
+    return l->ridges && may_be_behind(l, s) &&
+           lod_ridges_hide(l->ridges, s->at.x0 / l->cell, s->at.y0 / l->cell, stage_of(l, s->depth) + 1 - l->levels);
 }
 
 static sight look_at(const lod *l, const subject *s, unsigned rules)
@@ -320,11 +331,14 @@ static sight look_at(const lod *l, const subject *s, unsigned rules)
     if (s->void_corners) /* the other diagonal may be drawn, by whichever half of the square: see both alike */
         to_apex = 1.1 * to_a;
     double radius = MORE * sqrt(fmax(to_a, to_apex)) + CURVING * s->leg * s->leg + s->reach * l->unit + 1e-6 * far;
-    sight out = {fmax(0, far - radius), 0};
-    if (rules & TL_CULL_FRUSTUM && beside(l, middle, radius))
+    sight out = {.distance = fmax(0, far - radius), .margin = HUGE_VAL, .far = far};
+    bool box = !(s->depth & 1) && rules & (TL_CULL_BACK | TL_CULL_HORIZON) && s->leg > WORTH_IT * far;
+    if (rules & TL_CULL_FRUSTUM && beside(l, middle, radius, &out.margin))
         out.hidden = TL_CULL_FRUSTUM;
-    else if (!(s->depth & 1) && rules & (TL_CULL_BACK | TL_CULL_HORIZON) && s->leg > WORTH_IT * far)
+    else if (box)
         out.hidden = look_at_box(l, s, rules & ~(unsigned)TL_CULL_FRUSTUM).hidden;
+    if (box || (l->ridges && may_be_behind(l, s)))
+        out.margin = -1;
     if (!out.hidden && rules & TL_CULL_RIDGE && behind_ridge(l, s))
         out.hidden = TL_CULL_RIDGE;
     return out;
@@ -340,12 +354,29 @@ static bool out_of_band(const lod *l, int depth, double distance)
     return stage_of(l, depth) + 1 + l->field->info.level - l->levels > (int)k;
 }
 
-bool lod_wants(const lod *l, int depth, double error, double distance)
+static float priority_of(const lod *l, int depth, double error, double distance)
 {
     if (level_of(l, depth) > l->finest)
-        return false;
-    return l->options->band_count ? out_of_band(l, depth, distance)
-                                  : scene_view_pixels(l->view, error, distance) > l->pixel_error;
+        return -1;
+    if (l->options->band_count)
+        return out_of_band(l, depth, distance) ? HUGE_VALF : -1;
+    return (float)scene_view_pixels(l->view, error, distance);
+}
+
+bool lod_wants(const lod *l, int depth, double error, double distance)
+{
+    return (double)priority_of(l, depth, error, distance) > l->pixel_error;
+}
+
+void lod_allow(lod *l, double pixel_error)
+{
+    double small = 0, large = 1; /* of x = error / (2 distance): see scene_view_pixels */
+    l->pixel_error = pixel_error;
+    for (int k = 0; k < 60; k++) {
+        double middle = .5 * (small + large);
+        *(scene_view_pixels(l->view, 2 * middle, 1) > pixel_error ? &large : &small) = middle;
+    }
+    l->near = large > 0 ? 1 / (2 * large) : HUGE_VAL;
 }
 
 /* Whether a triangle wants to be split for its chunk; finds that, and whether it is hidden. */
@@ -369,18 +400,30 @@ lod_verdict lod_test(const lod *l, const lod_triangle *t, int depth, unsigned ru
     lod_middle(l, t, &x, &y);
     bool ends = stage < 0; /* legs of 1 */
     if (s.at.outside)
-        return (lod_verdict){.state = LOD_DROPPED};
+        return (lod_verdict){.state = LOD_DROPPED, .priority = -1, .margin = HUGE_VALF};
     find_error(l, &s, x / l->cell, y / l->cell);
     if (s.void_corners && (level > 0 || s.error < HUGE_VAL) && (level <= 0 || s.void_corners > 1))
-        return (lod_verdict){.state = LOD_DROPPED};
+        return (lod_verdict){.state = LOD_DROPPED, .priority = -1, .margin = HUGE_VALF};
     sight seen = look_at(l, &s, rules);
     if (seen.hidden)
-        return (lod_verdict){.state = LOD_HIDDEN, .rule = (unsigned char)seen.hidden};
+        return (lod_verdict){.state = LOD_HIDDEN,
+                             .rule = (unsigned char)seen.hidden,
+                             .priority = -1,
+                             .margin = seen.hidden == TL_CULL_FRUSTUM ? (float)seen.margin : -1,
+                             .far = (float)seen.far};
     bool forced = !(s.error < HUGE_VAL), can = !ends && !(level > 0 && s.void_corners);
-    lod_verdict out = {.pixels =
-                           forced ? HUGE_VALF : (float)scene_view_pixels(l->view, s.error * l->unit, seen.distance)};
-    bool wants = l->chunks ? wants_for_chunk(l, &s, t, &out) : lod_wants(l, depth, s.error * l->unit, seen.distance);
+    double error = s.error * l->unit;
+    lod_verdict out = {.pixels = forced ? HUGE_VALF : (float)scene_view_pixels(l->view, error, seen.distance),
+                       .priority = !can     ? -1
+                                   : forced ? HUGE_VALF
+                                            : priority_of(l, depth, error, seen.distance),
+                       .margin = (float)seen.margin,
+                       .far = (float)seen.far};
+    if (can && !forced && level <= l->finest)
+        out.margin = l->options->band_count ? -1 : (float)fmin(seen.margin, fabs(seen.distance - l->near * error));
+    if (l->chunks && can && !forced)
+        out.priority = wants_for_chunk(l, &s, t, &out) ? HUGE_VALF : -1;
     if (out.state != LOD_HIDDEN)
-        out.state = can && (forced || wants) ? LOD_SPLIT : LOD_LEAF;
+        out.state = (double)out.priority > l->pixel_error ? LOD_SPLIT : LOD_LEAF;
     return out;
 }
