@@ -78,9 +78,30 @@ static tl_status place_vertices(void *context, tl_parallel *loop, uint64_t item,
     return TL_OK;
 }
 
-static const double *corner(const scene_stage *s, size_t triangle, int k)
+static bool comes_first(const tl_vertex *a, const tl_vertex *b)
 {
-    return s->corners[s->mesh->indices[3 * triangle + (size_t)k]];
+    return a->j != b->j ? a->j < b->j : a->i < b->i;
+}
+
+/* The vertices of a triangle, from the one that comes first on the lattice: a mesh that begins its triangles elsewhere
+ * has the same picture, to the last bit. */
+static void vertices_of(const scene_stage *s, size_t triangle, uint32_t out[3])
+{
+    const uint32_t *v = &s->mesh->indices[3 * triangle];
+    const tl_vertex *all = s->mesh->vertices;
+    int first = comes_first(&all[v[1]], &all[v[0]]);
+    if (comes_first(&all[v[2]], &all[v[first]]))
+        first = 2;
+    for (int k = 0; k < 3; k++)
+        out[k] = v[(first + k) % 3];
+}
+
+static void corners_of(const scene_stage *s, size_t triangle, const double *out[3])
+{
+    uint32_t v[3];
+    vertices_of(s, triangle, v);
+    for (int k = 0; k < 3; k++)
+        out[k] = s->corners[v[k]];
 }
 
 static void cross(const double a[3], const double b[3], double out[3])
@@ -98,8 +119,10 @@ static double dot(const double a[3], const double b[3])
 /* The normal of a triangle, as long as twice its area: right, down, ahead. */
 static void face_normal(const scene_stage *s, size_t triangle, double out[3])
 {
-    const double *a = corner(s, triangle, 0), *b = corner(s, triangle, 1), *c = corner(s, triangle, 2);
-    const double e[3] = {b[0] - a[0], b[1] - a[1], b[2] - a[2]}, g[3] = {c[0] - a[0], c[1] - a[1], c[2] - a[2]};
+    const double *c[3];
+    corners_of(s, triangle, c);
+    const double e[3] = {c[1][0] - c[0][0], c[1][1] - c[0][1], c[1][2] - c[0][2]},
+                 g[3] = {c[2][0] - c[0][0], c[2][1] - c[0][1], c[2][2] - c[0][2]};
     double f = s->camera.focal, scaled[3];
     cross(e, g, scaled);
     out[0] = s->facing * scaled[0] / f;
@@ -137,7 +160,8 @@ static void add_normals(scene_stage *s)
 static span span_of(const scene_stage *s, size_t triangle)
 {
     const span none = {1, 0}, all = {0, (uint16_t)(s->bands - 1)};
-    const double *c[3] = {corner(s, triangle, 0), corner(s, triangle, 1), corner(s, triangle, 2)};
+    const double *c[3];
+    corners_of(s, triangle, c);
     double volume[3], low = (double)INFINITY, high = -(double)INFINITY, wide = s->camera.width / 2;
     cross(c[1], c[2], volume);
     if (!(s->facing * dot(c[0], volume) < 0)) /* also NaN */
@@ -201,8 +225,11 @@ void scene_stage_draw(const scene_stage *s, int band, scene_canvas *canvas)
     canvas->top = (double)top - s->camera.height / 2;
     scene_canvas_clear(canvas);
     for (size_t t = 0; t < s->mesh->triangle_count; t++)
-        if (s->spans[t].first <= band && band <= s->spans[t].last)
-            scene_canvas_draw(canvas, corner(s, t, 0), corner(s, t, 1), corner(s, t, 2), (uint32_t)t);
+        if (s->spans[t].first <= band && band <= s->spans[t].last) {
+            const double *c[3];
+            corners_of(s, t, c);
+            scene_canvas_draw(canvas, c[0], c[1], c[2], (uint32_t)t);
+        }
 }
 
 /* ---- lifecycle ---- */
@@ -310,7 +337,8 @@ static void set_normal(const scene_stage *s, const double n[3], float out[3])
 
 void scene_stage_point(const scene_stage *s, const scene_hit *hit, double x, double y, bool facet, scene_point *out)
 {
-    const uint32_t *v = &s->mesh->indices[3 * (size_t)hit->triangle];
+    uint32_t v[3];
+    vertices_of(s, hit->triangle, v);
     const double *corners[3] = {s->corners[v[0]], s->corners[v[1]], s->corners[v[2]]}, direction[3] = {x, y, 1};
     double shares[3], i = 0, j = 0, normal[3];
     shares_of(corners, direction, shares);
