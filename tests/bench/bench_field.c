@@ -2,6 +2,7 @@
  * and of writing it to EXR with all cores; as ratios to a copy and to a plain write of the same bytes. */
 #define _GNU_SOURCE /* O_TMPFILE */
 #include "lib/base/georef.h"
+#include "lib/base/parallel.h"
 #include "lib/talus.h"
 #include "tests/bench/bench.h"
 
@@ -38,6 +39,48 @@ static void measure_tiles(const char *what, const tl_source *source)
         printf("%-28s tiles of %3lld  %6.2f ns/sample (%5.1f copies)\n", what, (long long)tile, 1e9 * seconds / samples,
                seconds / copy);
     }
+}
+
+/* All tiles by one thread or by two, each into its own memory. */
+typedef struct threads {
+    const tl_source *source;
+    int64_t tile, columns;
+    unsigned threads;
+    float *out[2];
+} threads;
+
+static tl_status read_one(void *context, tl_parallel *loop, uint64_t item, unsigned worker, tl_error *error)
+{
+    (void)loop;
+    const threads *t = context;
+    tl_window window = {(int64_t)item % t->columns * t->tile, (int64_t)item / t->columns * t->tile, t->tile, t->tile};
+    return tl_source_read(t->source, t->source->info.level, window, t->out[worker], error);
+}
+
+static void read_by_threads(void *context)
+{
+    threads *t = context;
+    tl_run run = {.threads = t->threads};
+    tl_error error;
+    if (tl_parallel_for(&run, (uint64_t)(t->columns * t->columns), 0, read_one, t, &error) != TL_OK)
+        exit(1);
+}
+
+/* In turns, so that what else the machine does hits both alike. */
+static void measure_threads(const char *what, const tl_source *source)
+{
+    threads t = {.source = source, .tile = 256, .columns = 8};
+    double best[2] = {1e9, 1e9};
+    for (int k = 0; k < 2; k++)
+        t.out[k] = calloc(TILE_MAX * TILE_MAX, sizeof *t.out[k]);
+    for (int run = 0; run < 4 * RUNS; run++) {
+        t.threads = 1 + (unsigned)run % 2;
+        double seconds = bench_minimum(read_by_threads, &t, 1);
+        best[run % 2] = seconds < best[run % 2] ? seconds : best[run % 2];
+    }
+    printf("%-28s two threads: %.2f times as fast as one\n", what, best[0] / best[1]);
+    for (int k = 0; k < 2; k++)
+        free(t.out[k]);
 }
 
 static void write_exr(void *context)
@@ -81,6 +124,38 @@ static void measure_writing(const tl_source *source)
     free(row);
 }
 
+/* fBm of one exponent, and of maps. */
+static void measure_fbm(const tl_source *dem)
+{
+    static float exponents[DEM * DEM], deltas[DEM * DEM];
+    for (int k = 0; k < DEM * DEM; k++) {
+        exponents[k] = .2F + .7F * (float)(k % DEM) / DEM;
+        deltas[k] = 1 + (float)(k / DEM) / 100;
+    }
+    tl_source *hurst = tl_array_source_create(exponents, &dem->info, NULL);
+    tl_source *delta = tl_array_source_create(deltas, &dem->info, NULL);
+    for (int maps = 0; maps < 2; maps++) {
+        tl_field_options options = {.levels = 4,
+                                    .hurst_given = true,
+                                    .hurst = .7,
+                                    .delta_given = true,
+                                    .delta = 3,
+                                    .hurst_map = maps ? hurst : NULL,
+                                    .delta_map = maps ? delta : NULL};
+        tl_source *field = tl_field_create(dem, &options, NULL);
+        if (!field)
+            exit(1);
+        char what[64];
+        snprintf(what, sizeof what, "fBm%s, %s", maps ? " by maps" : "",
+                 dem->info.type == TL_RASTER_AREA ? "area" : "point");
+        measure_tiles(what, field);
+        measure_threads(what, field);
+        tl_source_destroy(field);
+    }
+    tl_source_destroy(hurst);
+    tl_source_destroy(delta);
+}
+
 static float *make_dem(void)
 {
     float *heights = malloc(sizeof *heights * DEM * DEM);
@@ -107,14 +182,17 @@ int main(void)
                 return 1;
             snprintf(what, sizeof what, "field, %s, %d levels", type == TL_RASTER_AREA ? "area" : "point", levels);
             measure_tiles(what, field);
+            measure_threads(what, field);
             if (levels == 2 && type == TL_RASTER_POINT)
                 measure_writing(field);
             tl_source_destroy(field);
         }
+        measure_fbm(dem);
         tl_source_destroy(dem);
     }
     tl_source *noise = tl_noise_create(&(tl_noise_options){.size = OUTPUT, .hurst = 0.8, .delta = 1}, NULL);
     measure_tiles("noise", noise);
+    measure_threads("noise", noise);
     tl_source_destroy(noise);
     free(heights);
     return 0;
