@@ -125,6 +125,9 @@ void lod_prepare_tests(lod *l);
 /* Looks at a triangle of this depth, hidden by the rules of `rules` only (an or of tl_culling). Any number of threads.
  * Its block must be made; see lod_block_depth. */
 lod_verdict lod_test(const lod *l, const lod_triangle *triangle, int depth, unsigned rules);
+/* Whether ridges may hide a triangle of this depth; and whether they do. */
+bool lod_at_ridge(const lod *l, int depth);
+bool lod_behind_ridge(const lod *l, const lod_triangle *t, int depth);
 /* A bound of what the field adds to heights of the model's own triangles of cells like these; NULL: of any. The same
  * for triangles of a depth. Units of height. */
 double lod_residual(const lod *l, const scene_cells *cells);

@@ -15,7 +15,7 @@
 #include <math.h>
 #include <string.h>
 
-enum { TESTED = 512, REFERENCES = 3 };
+enum { TESTED = 512, REFERENCES = 3, RIDGE_RULE = 3 /* log2 of TL_CULL_RIDGE */ };
 
 /* Verdicts do not hold closer to their change than this share of the distance: places are interpolated, from view to
  * view a little differently, to far less than a pixel. */
@@ -326,6 +326,12 @@ static tl_status test_nodes(tl_roam *r, const lod_list *list, tl_error *error)
 /* Whether the eye's movement has used a verdict up. */
 static bool is_stale(const tl_roam *r, const node *n)
 {
+    bool behind = n->state == LOD_HIDDEN && n->rule == RIDGE_RULE;
+    if (lod_at_ridge(&r->l, n->depth) && n->state != LOD_DROPPED && (behind || n->state != LOD_HIDDEN) &&
+        lod_behind_ridge(&r->l, &n->triangle, n->depth) != behind)
+        return true;
+    if (behind)
+        return false;
     double moved = r->moved - (double)n->moved, turned = r->turned - (double)n->turned;
     double rounded = 1e-6 * r->moved + 1e-6 * r->turned * (double)n->far;
     return moved + 1.1 * turned * ((double)n->far + moved) + UNSURE * (double)n->far + rounded >= (double)n->margin;

@@ -299,23 +299,29 @@ static sight look_at_box(const lod *l, const subject *s, unsigned rules)
     return out;
 }
 
-/* Ridges hide squares of some sizes. */
-static bool may_be_behind(const lod *l, const subject *s)
+bool lod_at_ridge(const lod *l, int depth)
 {
-    return !(s->depth & 1) && stage_of(l, s->depth) + 1 - l->levels >= LOD_RIDGE_LOG;
+    return l->ridges && !(depth & 1) && stage_of(l, depth) + 1 - l->levels >= LOD_RIDGE_LOG;
 }
 
-static bool behind_ridge(const lod *l, const subject *s)
+static bool behind_ridge(const lod *l, const lying *at, int depth)
 {
-    return l->ridges && may_be_behind(l, s) &&
-           lod_ridges_hide(l->ridges, s->at.x0 / l->cell, s->at.y0 / l->cell, stage_of(l, s->depth) + 1 - l->levels);
+    return lod_at_ridge(l, depth) &&
+           lod_ridges_hide(l->ridges, at->x0 / l->cell, at->y0 / l->cell, stage_of(l, depth) + 1 - l->levels);
+}
+
+bool lod_behind_ridge(const lod *l, const lod_triangle *t, int depth)
+{
+    const lod_vertex *v[3] = {lod_at(l, t->a), lod_at(l, t->b), lod_at(l, t->apex)};
+    lying at = lie_of(l, v);
+    return behind_ridge(l, &at, depth);
 }
 
 static sight look_at(const lod *l, const subject *s, unsigned rules)
 {
     if (s->at.over || s->leg > LONGEST || l->degrees * (s->at.x1 - s->at.x0) / l->cell > WIDEST) {
         sight wide = look_at_box(l, s, rules);
-        if (!wide.hidden && rules & TL_CULL_RIDGE && behind_ridge(l, s))
+        if (!wide.hidden && rules & TL_CULL_RIDGE && behind_ridge(l, &s->at, s->depth))
             wide.hidden = TL_CULL_RIDGE;
         return wide;
     }
@@ -337,9 +343,9 @@ static sight look_at(const lod *l, const subject *s, unsigned rules)
         out.hidden = TL_CULL_FRUSTUM;
     else if (box)
         out.hidden = look_at_box(l, s, rules & ~(unsigned)TL_CULL_FRUSTUM).hidden;
-    if (box || (l->ridges && may_be_behind(l, s)))
+    if (box)
         out.margin = -1;
-    if (!out.hidden && rules & TL_CULL_RIDGE && behind_ridge(l, s))
+    if (!out.hidden && rules & TL_CULL_RIDGE && behind_ridge(l, &s->at, s->depth))
         out.hidden = TL_CULL_RIDGE;
     return out;
 }
@@ -409,7 +415,9 @@ lod_verdict lod_test(const lod *l, const lod_triangle *t, int depth, unsigned ru
         return (lod_verdict){.state = LOD_HIDDEN,
                              .rule = (unsigned char)seen.hidden,
                              .priority = -1,
-                             .margin = seen.hidden == TL_CULL_FRUSTUM ? (float)seen.margin : -1,
+                             .margin = seen.hidden == TL_CULL_RIDGE     ? HUGE_VALF
+                                       : seen.hidden == TL_CULL_FRUSTUM ? (float)seen.margin
+                                                                        : -1,
                              .far = (float)seen.far};
     bool forced = !(s.error < HUGE_VAL), can = !ends && !(level > 0 && s.void_corners);
     double error = s.error * l->unit;
