@@ -19,7 +19,7 @@ enum { TESTED = 512, REFERENCES = 3, RIDGE_RULE = 3 /* log2 of TL_CULL_RIDGE */ 
 
 /* Verdicts do not hold closer to their change than this share of the distance: places are interpolated, from view to
  * view a little differently, to far less than a pixel. */
-static const double UNSURE = 2e-3;
+static const double UNSURE = 5e-4;
 /* Places of the same samples in two views are as far apart to this share, or the views are bent differently. */
 static const double RIGID = 1e-5;
 

@@ -17,7 +17,7 @@ static const double QUANTILE = 2.6;
 /* Rises of the surface between neighbouring vertices that do not happen: standard deviations. */
 static const double STEEPEST = 5;
 /* Triangles that look larger than this, radians, are tried by the rules that cost much; smaller ones lie in such. */
-static const double WORTH_IT = .02;
+static const double WORTH_IT = .05;
 /* Legs (metres) and widths (degrees of longitude) up to which the triangle's corners tell where it is. */
 static const double LONGEST = 2e4, WIDEST = 8;
 /* A lattice line of at most WIDEST degrees is off its chord by at most tan(WIDEST / 4) / 2 of it; and one of `leg`
