@@ -625,14 +625,13 @@ typedef struct tl_field_options {
     uint64_t seed;
     const tl_run *run; /* for the measurement, which reads the DEM once */
     tl_support support;
-    /* Rasters of the Hurst exponent (0.01 ... 0.99) and of delta (0 ... 1e30, in units of height) from place to place,
-     * for schemes of fBm; NULL: one value everywhere. They are laid over the DEM by coordinates where both are
-     * georeferenced, in one CRS, else from edge to edge, and are sampled bilinearly at the DEM's samples; beyond a
-     * map's rim its last values go on, and where it is void the DEM's own value holds: `hurst` and `delta`, else what
-     * is measured. Between the samples both go on bilinearly, and an octave l below the DEM has the amplitude
-     * delta 2^(-l H) of the place. A map of the exponent is for the scheme "stationary" and cells of 0.71 ... 1.41
-     * times their height; the exponent of every octave below is then the map's. Both are read once when the field is
-     * created, and must outlive it. */
+    /* Rasters of the Hurst exponent (0 ... 2; the nearest of 0.01 ... 0.99 is taken) and of delta (0 ... 1e30, in units
+     * of height) from place to place, for schemes of fBm; NULL: one value everywhere. They are laid over the DEM by
+     * coordinates where both are georeferenced, in one CRS, else from edge to edge, and are sampled bilinearly at the
+     * DEM's samples; beyond a map's rim its last values go on, and where it is void the DEM's own value holds: `hurst`
+     * and `delta`, else what is measured. Between the samples both go on bilinearly, and an octave l below the DEM has
+     * the amplitude delta 2^(-l H) of the place. A map of the exponent is for the scheme "stationary"; the exponent of
+     * every octave below is then the map's. Both are read once when the field is created, and must outlive it. */
     const tl_source *hurst_map, *delta_map;
     /* The delta map holds sigma of the finest octave instead, as the second band of tl_statistics_write_maps does;
      * delta is then that of fBm with this detail and the place's exponent. */
@@ -783,9 +782,9 @@ typedef struct tl_roam tl_roam;
 /* As tl_select; options->selector does not matter, and options->run is copied. Borrows the three. */
 TL_API tl_roam *tl_roam_create(const tl_source *field, const tl_source *dem, const tl_pyramid *pyramid,
                                const tl_lod_options *options, tl_error *error);
-/* Looks from another view. Of the statistics, `seconds` are those of choosing the triangles, `vertices` are all that are
- * kept, and `pixel_error` is by what was found when a triangle was last looked at. After a failure only the destroyer
- * is left. `stats` may be NULL. */
+/* Looks from another view. Of the statistics, `seconds` are those of choosing the triangles, `vertices` are all that
+ * are kept, and `pixel_error` is by what was found when a triangle was last looked at. After a failure only the
+ * destroyer is left. `stats` may be NULL. */
 TL_API tl_status tl_roam_look(tl_roam *roam, const tl_view *view, tl_lod_stats *stats, tl_error *error);
 /* The mesh for the last view. */
 TL_API tl_status tl_roam_mesh(tl_roam *roam, tl_mesh **out, tl_error *error);
@@ -833,10 +832,10 @@ typedef struct tl_view_report {
  * column and row of the lattice (both as the flat triangles have it there): how far the picture of a piece of ground is
  * shifted, whether or not the mesh's own relief then hides it. *Silhouettes* are what parallax leaves out: with 4 x 4
  * samples a pixel, at every sample beside an edge of the reference's picture (one of its four neighbours is nearer or
- * farther ahead by more than a tenth, or sky), how far around it one must look in the mesh's picture to see something as
- * near and something as far, to a tenth (sky is farthest): how far the edge is shifted. And the same from the edges of
- * the mesh's picture to that of the reference. It comes in steps of a quarter of a pixel; 4 stands for 4 or more. Takes
- * some 70 bytes a triangle of the mesh and 16 of the reference. */
+ * farther ahead by more than a tenth, or sky), how far around it one must look in the mesh's picture to see something
+ * as near and something as far, to a tenth (sky is farthest): how far the edge is shifted. And the same from the edges
+ * of the mesh's picture to that of the reference. It comes in steps of a quarter of a pixel; 4 stands for 4 or more.
+ * Takes some 70 bytes a triangle of the mesh and 16 of the reference. */
 TL_API tl_status tl_view_measure(const tl_mesh *mesh, const tl_mesh *reference, const tl_source *dem,
                                  const tl_view *view, const tl_run *run, tl_view_report *out, tl_error *error);
 

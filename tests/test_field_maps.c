@@ -82,6 +82,13 @@ static float five(int i, int j)
     return 5;
 }
 
+static float one_half(int i, int j)
+{
+    (void)i;
+    (void)j;
+    return .5F;
+}
+
 static float nothing(int i, int j)
 {
     (void)i;
@@ -161,6 +168,60 @@ static void mapsOfOneValueMakeTheSameField(void **state)
     tl_source_destroy(delta.source);
 }
 
+/* Cells whose rows are halved once and twice, or columns, at an exponent that the halvings' weights are made for. */
+static void mapsOfOneValueFollowTheShapeOfCells(void **state)
+{
+    (void)state;
+    static const double aspects[] = {.8, .55, .3, 2.2};
+    raster dem, hurst;
+    raster_make(&hurst, one_half, TL_RASTER_POINT, 30, "hurst");
+    for (size_t k = 0; k < sizeof aspects / sizeof *aspects; k++) {
+        raster_make(&dem, ground_at, TL_RASTER_POINT, 30, "ground");
+        dem.source->info.georef.cell_x *= aspects[k];
+        tl_field_options options = fbm_of;
+        options.scheme = "stationary";
+        options.levels = 3;
+        options.hurst = .5;
+        tl_source *plain = make_field(dem.source, options);
+        options.hurst_map = hurst.source;
+        tl_source *placed = make_field(dem.source, options);
+        assert_true(largest_difference(plain, placed) < nearly);
+        tl_source_destroy(plain), tl_source_destroy(placed), tl_source_destroy(dem.source);
+    }
+    tl_source_destroy(hurst.source);
+}
+
+static float above_one(int i, int j)
+{
+    (void)j;
+    return i % 2 ? 1.3F : 1.9F;
+}
+
+static float ninety_nine(int i, int j)
+{
+    (void)i;
+    (void)j;
+    return .99F;
+}
+
+/* What real terrain measures where it is smooth. */
+static void exponentsAboveOneAreTheNearest(void **state)
+{
+    (void)state;
+    raster dem, high, most;
+    raster_make(&dem, ground_at, TL_RASTER_POINT, 30, "ground");
+    raster_make(&high, above_one, TL_RASTER_POINT, 30, "high");
+    raster_make(&most, ninety_nine, TL_RASTER_POINT, 30, "most");
+    tl_field_options options = fbm_of;
+    options.hurst_map = high.source;
+    tl_source *a = make_field(dem.source, options);
+    options.hurst_map = most.source;
+    tl_source *b = make_field(dem.source, options);
+    assert_true(largest_difference(a, b) == 0);
+    tl_source_destroy(a), tl_source_destroy(b);
+    tl_source_destroy(dem.source), tl_source_destroy(high.source), tl_source_destroy(most.source);
+}
+
 static void voidsInMapsTakeTheModelsOwn(void **state)
 {
     (void)state;
@@ -185,7 +246,7 @@ static void check_windows(const tl_source *field)
     float *whole = read_all(field);
     int64_t width = field->info.width, height = field->info.height;
     for (int n = 0; n < 20; n++) {
-        tl_window w = {.width = 1 + arbitrary(200), .height = 1 + arbitrary(200)};
+        tl_window w = {.width = 1 + arbitrary(110), .height = 1 + arbitrary(110)};
         w.x = arbitrary((uint32_t)(width - w.width + 1));
         w.y = arbitrary((uint32_t)(height - w.height + 1));
         float *part = read_part(field, w);
@@ -206,13 +267,13 @@ static void windowsUnderMapsEqualTheWhole(void **state)
     raster_make(&hurst, voids_about, TL_RASTER_POINT, 30, "hurst");
     raster_make(&delta, strength_at, TL_RASTER_POINT, 30, "delta");
     for (int type = 0; type < 2; type++)
-        for (int shape = 0; shape < 3; shape++)
+        for (int shape = 0; shape < 5; shape++)
             for (int maps = 1; maps < 4; maps++) {
                 raster_make(&dem, ground_at, (tl_raster_type)type, 30, "ground");
-                static const double aspects[3] = {1, .8, 1.3};
+                static const double aspects[5] = {1, .8, 1.3, .3, 2.2};
                 dem.source->info.georef.cell_x *= aspects[shape];
                 tl_field_options options = fbm_of;
-                options.levels = 4;
+                options.levels = shape < 3 ? 4 : 2;
                 options.hurst_map = maps & 1 ? hurst.source : NULL;
                 options.delta_map = maps & 2 ? delta.source : NULL;
                 tl_source *field = make_field(dem.source, options);
@@ -271,6 +332,8 @@ static void meansOfCellsAreKeptUnderMaps(void **state)
 
 /* ---- Where maps lie -------------------------------------------------------------------------------- */
 
+static const scene_field_map_rule zero_to_one = {"numbers", 0, 1, 0, 1};
+
 static void check_laid(const scene_field_map *map, double i0, double step)
 {
     float out[WIDTH * HEIGHT];
@@ -294,7 +357,7 @@ static void mapsAreLaidByPlace(void **state)
     model.georef.transform[0] = 40;
     model.georef.transform[3] = -40;
     scene_field_map laid;
-    assert_int_equal(scene_field_map_open(map.source, &model, "numbers", 0, 1, 0, NULL, &laid, NULL), TL_OK);
+    assert_int_equal(scene_field_map_open(map.source, &model, &zero_to_one, 0, NULL, &laid, NULL), TL_OK);
     check_laid(&laid, .5, .25);
     assert_true(laid.least == 0);
     tl_source_destroy(map.source);
@@ -309,10 +372,10 @@ static void mapsWithoutAPlaceCoverTheModel(void **state)
     map.source->info.georef = tl_georef_none();
     tl_source_info model = info_of(2 * WIDTH, 2 * HEIGHT, TL_RASTER_AREA, 20, "model");
     scene_field_map laid;
-    assert_int_equal(scene_field_map_open(map.source, &model, "numbers", 0, 1, 1, NULL, &laid, NULL), TL_OK);
+    assert_int_equal(scene_field_map_open(map.source, &model, &zero_to_one, 1, NULL, &laid, NULL), TL_OK);
     check_laid(&laid, -.25, .5);
     model = info_of(WIDTH, HEIGHT, TL_RASTER_AREA, 20, "model");
-    assert_int_equal(scene_field_map_open(map.source, &model, "numbers", 0, 1, 1, NULL, &laid, NULL), TL_OK);
+    assert_int_equal(scene_field_map_open(map.source, &model, &zero_to_one, 1, NULL, &laid, NULL), TL_OK);
     check_laid(&laid, 0, 1);
     tl_source_destroy(map.source);
 }
@@ -329,7 +392,7 @@ static void mapsGoAroundWithTheModel(void **state)
     map.source->info.wraps = true;
     scene_field_map laid;
     float out[6 * WIDTH];
-    assert_int_equal(scene_field_map_open(map.source, &model, "numbers", 0, 1, 1, NULL, &laid, NULL), TL_OK);
+    assert_int_equal(scene_field_map_open(map.source, &model, &zero_to_one, 1, NULL, &laid, NULL), TL_OK);
     assert_int_equal(scene_field_map_read(&laid, (fbm_window){-WIDTH, 3, 6 * WIDTH, 1, 0}, out, NULL), TL_OK);
     for (int i = -WIDTH; i < 5 * WIDTH; i++) {
         double u = (double)((i + 2 * WIDTH) % (2 * WIDTH)) / 2 - .25, part = u - floor(u);
@@ -359,7 +422,7 @@ static void wrongMapsAreTold(void **state)
     raster_make(&delta, five, TL_RASTER_POINT, 30, "delta.tif");
     tl_field_options options = fbm_of;
     options.hurst_map = delta.source;
-    check_refused(dem.source, options, "delta.tif: holds 5 ... 5, but Hurst exponents must be from 0.01 to 0.99");
+    check_refused(dem.source, options, "delta.tif: holds 5 ... 5, but Hurst exponents must be from 0 to 2");
     options.hurst_map = hurst.source;
     options.scheme = "terrain";
     check_refused(dem.source, options, "scheme 'terrain' takes no maps");
@@ -478,6 +541,8 @@ int main(void)
 {
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(mapsOfOneValueMakeTheSameField),
+        cmocka_unit_test(mapsOfOneValueFollowTheShapeOfCells),
+        cmocka_unit_test(exponentsAboveOneAreTheNearest),
         cmocka_unit_test(voidsInMapsTakeTheModelsOwn),
         cmocka_unit_test(windowsUnderMapsEqualTheWhole),
         cmocka_unit_test(samplesAreKeptUnderMaps),

@@ -1,6 +1,7 @@
 #include "lib/scene/chain.h"
 
 #include "fbm/elementary.h"
+#include "fbm/kernel.h"
 #include "lib/base/error.h"
 #include "lib/base/size.h"
 
@@ -27,7 +28,8 @@ typedef struct work {
     fbm_window fields[STAGES + 1];
     int field; /* the stage that the coefficients of strength 1 are of, -1: none */
     float *unit, *values, *strengths, *place_scratch;
-    float *made; /* NULL: it is made in its place */
+    float *faded, *halved; /* of halvings by place: strengths of the noise, and a result for one exponent */
+    float *made;           /* NULL: it is made in its place */
     float *scratch;
     void *rows; /* weights that follow the rows */
 } work;
@@ -143,6 +145,8 @@ static void work_free(work *w)
     free(w->values);
     free(w->strengths);
     free(w->place_scratch);
+    free(w->faded);
+    free(w->halved);
     free(w->made);
     free(w->scratch);
     free(w->rows);
@@ -195,9 +199,9 @@ static bool allocate(work *w, bool in_place)
         size_t samples;
         if (!tl_size_mul(w->windows[s].width, w->windows[s].height, &samples))
             return false;
-        if (s < w->stages || w->centres)
+        if (s < w->stages || w->centres || w->chain->placed)
             most[s & 1] = larger(most[s & 1], samples);
-        else
+        if (s == w->stages)
             last = samples;
         width = larger(width, w->windows[s].width);
         height = larger(height, w->windows[s].height);
@@ -212,6 +216,11 @@ static bool allocate(work *w, bool in_place)
     if (w->chain->placed)
         plan_fields(w);
     good = good && allocate_planes(w, most) && (!w->chain->placed || allocate_places(w));
+    if (w->chain->placed && w->chain->shape.halvings) {
+        w->faded = tl_alloc(larger(most[0], most[1]), sizeof(float));
+        w->halved = tl_alloc(larger(larger(most[0], most[1]), last), sizeof(float));
+        good = good && w->faded && w->halved;
+    }
     size_t scratch = larger(fbm_refine_scratch(2 * width), fbm_rows_scratch(width));
     w->scratch = tl_alloc(scratch, sizeof(float));
     w->made = in_place ? NULL : tl_alloc(last, sizeof(float));
@@ -257,20 +266,29 @@ static fbm_step step_at(work *w, int stage)
     return step;
 }
 
-static fbm_row_step row_step_at(work *w, int stage)
+/* With the weights of a table that follow the rows, or that has one aspect. */
+static fbm_row_step row_step_by(work *w, int stage, const fbm_row_table *table)
 {
     const scene_chain *c = w->chain;
     fbm_row_step step = c->row_steps[stage];
-    if (!c->row_tables)
+    if (!c->row_tables) {
+        fbm_row_table_at(table, table->low, &step.weights);
         return step;
+    }
     fbm_row_weights *rows = w->rows;
     step.first_row = w->windows[stage].j;
     for (size_t k = 0; k < w->windows[stage].height; k++) {
         double place = (double)(2 * (step.first_row + (int64_t)k) + 1) * half_row(stage);
-        fbm_row_table_at(&c->row_tables[stage], log_aspect(&c->shape, place), &rows[k]);
+        fbm_row_table_at(table, log_aspect(&c->shape, place), &rows[k]);
     }
     step.rows = rows;
     return step;
+}
+
+static fbm_row_step row_step_at(work *w, int stage)
+{
+    const scene_chain *c = w->chain;
+    return c->row_tables ? row_step_by(w, stage, &c->row_tables[stage]) : c->row_steps[stage];
 }
 
 /* ---- Refining ---------------------------------------------------------------------------------- */
@@ -331,8 +349,62 @@ static fbm_places places_at(work *w, int stage)
         .shift = stage - field, .square = square, .window = window, .values = w->values, .scratch = w->place_scratch};
 }
 
+/* An exponent's place among the exponents of halvings. */
+static float row_place(float hurst)
+{
+    const float most = SCENE_ROW_EXPONENTS - 1;
+    return fminf(fmaxf((hurst - FBM_PLACES_LOW) * (most / .98F), 0), most);
+}
+
+/* Adds what one exponent has in the results of all to new rows; old ones are the same in each. */
+static void add_halved(const work *w, int stage, int exponent, float *out)
+{
+    const fbm_window *to = &w->windows[stage + 1];
+    const float *hurst = w->planes[(stage + 1) & 1][SCENE_HURST];
+    for (size_t y = 0; y < to->height; y++) {
+        const float *from = w->halved + y * to->width, *h = hurst + y * to->width;
+        float *row = out + y * to->stride;
+        if ((to->j + (int64_t)y) % 2 == 0)
+            memcpy(row, from, to->width * sizeof *row);
+        else
+            for (size_t x = 0; x < to->width; x++)
+                row[x] += fmaxf(1 - fabsf(row_place(h[x]) - (float)exponent), 0) * from[x];
+    }
+}
+
+/* A halving of the rows by place: weights are linear between exponents, so it is the mean of what these make of the
+ * same noise. Only exponents that occur are made; of the others the share is 0. The planes of the next stage must be
+ * there. */
+static void halve_by_place(work *w, int stage, float *out)
+{
+    const fbm_window *from = &w->windows[stage], *to = &w->windows[stage + 1];
+    const float *strength = w->planes[stage & 1][SCENE_STRENGTH], *hurst = w->planes[stage & 1][SCENE_HURST];
+    const float fall = (float)(w->chain->fall - w->chain->shape.halvings + stage);
+    fbm_kernels()[0]->strengths(strength, hurst, fall, w->faded, from->width * from->height);
+    float low = SCENE_ROW_EXPONENTS, high = 0;
+    for (size_t k = 0; k < to->width * to->height; k++) {
+        float place = row_place(w->planes[(stage + 1) & 1][SCENE_HURST][k]);
+        low = fminf(low, place);
+        high = fmaxf(high, place);
+    }
+    for (size_t y = 0; y < to->height; y++)
+        memset(out + y * to->stride, 0, to->width * sizeof *out);
+    fbm_window dense = *to;
+    dense.stride = to->width;
+    for (int e = (int)low; e < SCENE_ROW_EXPONENTS && (float)e < high + 1; e++) {
+        fbm_row_step step = row_step_by(w, stage, &w->chain->place_rows[stage * SCENE_ROW_EXPONENTS + e]);
+        step.amplitude = 1;
+        fbm_refine_rows(&step, w->level[stage & 1], w->faded, *from, w->halved, dense, w->scratch);
+        add_halved(w, stage, e, out);
+    }
+}
+
 static void run_stage(work *w, int stage, float *out)
 {
+    if (w->chain->placed && stage < w->chain->shape.halvings) {
+        halve_by_place(w, stage, out);
+        return;
+    }
     const float *in = w->level[stage & 1], *map = w->chain->placed ? NULL : w->planes[stage & 1][SCENE_STRENGTH];
     if (stage < w->chain->shape.halvings) {
         fbm_row_step step = row_step_at(w, stage);
@@ -365,11 +437,10 @@ static void run_centres(work *w, float *out, fbm_window cells)
 static void refine_all(work *w, float *out, fbm_window cells)
 {
     for (int s = 0; s < w->stages; s++) {
-        bool last = s + 1 == w->stages && !w->centres;
-        run_stage(w, s, last ? out : w->level[(s + 1) & 1]);
-        bool halving = s < w->chain->shape.halvings;
-        if (!last && (w->chain->placed ? halving : w->chain->mapped))
+        bool last = s + 1 == w->stages && !w->centres, halving = s < w->chain->shape.halvings;
+        if (w->chain->placed ? halving : w->chain->mapped && !last)
             refine_planes(w, s, w->windows[s], w->windows[s + 1]);
+        run_stage(w, s, last ? out : w->level[(s + 1) & 1]);
     }
     if (w->centres)
         run_centres(w, out, cells);
@@ -472,6 +543,17 @@ tl_status scene_chain_fit_places(scene_chain *chain, const char *name, tl_error 
     if (!chain->place_values)
         return tl_fail_memory(error, name);
     fbm_places_table_make(low, high, chain->place_values, &chain->places);
+    if (shape->halvings) {
+        chain->place_rows = tl_alloc((size_t)shape->halvings * SCENE_ROW_EXPONENTS, sizeof *chain->place_rows);
+        if (!chain->place_rows)
+            return tl_fail_memory(error, name);
+    }
+    for (int k = 0; k < shape->halvings * SCENE_ROW_EXPONENTS; k++) {
+        int step = k / SCENE_ROW_EXPONENTS, back = step - shape->halvings;
+        double hurst =
+            FBM_HURST_MIN + k % SCENE_ROW_EXPONENTS * (FBM_HURST_MAX - FBM_HURST_MIN) / (SCENE_ROW_EXPONENTS - 1);
+        fbm_row_table_make(hurst, low + back, high + back, step == 0 && shape->halvings == 2, &chain->place_rows[k]);
+    }
     chain->placed = chain->mapped = true;
     /* delta is over the geometric mean of a cell's sides, the noise is in units of the rows' spacing */
     chain->fall = shape->halvings + fbm_log2(shape->aspect) / 2;

@@ -18,6 +18,9 @@ typedef struct scene_shape {
     double low, high; /* of these */
 } scene_shape;
 
+/* Exponents between which the weights of halvings are linear, from FBM_HURST_MIN to FBM_HURST_MAX. */
+enum { SCENE_ROW_EXPONENTS = 25 };
+
 typedef struct scene_chain {
     fbm_step steps[SCENE_LEVEL_MAX + 1]; /* steps[l] leads from level l to level l + 1 */
     bool mapped;                         /* the noise has a strength that varies: `load` tells it */
@@ -25,7 +28,8 @@ typedef struct scene_chain {
     bool placed;
     fbm_places_table places;
     float *place_values;
-    double fall; /* of the noise before the first level: its amplitude is delta 2^(-(fall + level) H) */
+    fbm_row_table *place_rows; /* of the halvings: [halvings][SCENE_ROW_EXPONENTS] */
+    double fall;               /* of the noise before the first level: its amplitude is delta 2^(-(fall + level) H) */
     scene_shape shape;
     fbm_row_step row_steps[2]; /* of the halvings */
     /* Weights that follow the rows, where the shape does; NULL, or [SCENE_LEVEL_MAX + 1] and [2]. */

@@ -397,19 +397,16 @@ static tl_status open_maps(field *f, const tl_field_options *o, tl_error *error)
     const tl_source_info *dem = &f->dem->info;
     scene_field_map *delta = &f->maps[SCENE_STRENGTH], *hurst = &f->maps[SCENE_HURST];
     f->growth.delta = delta->fallback; /* of the model's surroundings */
-    if (o->hurst_map && f->chain.shape.halvings)
-        return tl_fail(error, TL_ERROR_ARGUMENT,
-                       "%s: a map of H needs cells that are 0.71 to 1.41 times as wide as high, not %.3g; reproject it",
-                       dem->name, dem->georef.cell_x / dem->georef.cell_y);
     bool sigma = o->delta_map && o->delta_map_is_sigma;
     units_of(f, sigma);
     f->chain.mapped = true;
-    tl_status status = scene_field_map_open(o->hurst_map, dem, "Hurst exponents", FBM_HURST_MIN, FBM_HURST_MAX,
-                                            hurst->fallback, o->run, hurst, error);
+    /* real terrain measures above 1 where it is smooth: that is as near as fBm comes */
+    const scene_field_map_rule exponents = {"Hurst exponents", 0, 2, FBM_HURST_MIN, FBM_HURST_MAX};
+    const scene_field_map_rule strengths = {sigma ? "sigma" : "delta", 0, 1e30, 0, 1e30};
+    tl_status status = scene_field_map_open(o->hurst_map, dem, &exponents, hurst->fallback, o->run, hurst, error);
     double known = delta->fallback * (sigma ? unit_at(f, hurst->fallback) : 1);
     if (status == TL_OK)
-        status =
-            scene_field_map_open(o->delta_map, dem, sigma ? "sigma" : "delta", 0, 1e30, known, o->run, delta, error);
+        status = scene_field_map_open(o->delta_map, dem, &strengths, known, o->run, delta, error);
     for (int l = 0; o->hurst_map && l <= SCENE_LEVEL_MAX; l++) { /* no place has more */
         f->hursts[l] = fmax(hurst->least, FBM_HURST_MIN);
         f->deltas[l] = fbm_exp2(-l * f->hursts[l]);

@@ -44,11 +44,15 @@ static tl_status lay(const tl_source_info *model, const tl_source_info *map, dou
     return TL_OK;
 }
 
-tl_status scene_field_map_open(const tl_source *map, const tl_source_info *model, const char *what, double low,
-                               double high, double fallback, const tl_run *run, scene_field_map *out, tl_error *error)
+tl_status scene_field_map_open(const tl_source *map, const tl_source_info *model, const scene_field_map_rule *rule,
+                               double fallback, const tl_run *run, scene_field_map *out, tl_error *error)
 {
-    *out = (scene_field_map){
-        .source = map, .fallback = fallback, .least = fallback, .turn = model->wraps ? model->width : 0};
+    *out = (scene_field_map){.source = map,
+                             .fallback = fallback,
+                             .least = fallback,
+                             .turn = model->wraps ? model->width : 0,
+                             .low = rule->nearest_low,
+                             .high = rule->nearest_high};
     if (!map)
         return TL_OK;
     tl_status status = lay(model, &map->info, out->to, error);
@@ -57,11 +61,12 @@ tl_status scene_field_map_open(const tl_source *map, const tl_source_info *model
     quiet.progress = NULL;
     if (status == TL_OK)
         status = tl_source_range(map, &quiet, &range, error);
-    if (status == TL_OK && range.voids < range.samples && !(range.low >= (float)low && range.high <= (float)high))
+    if (status == TL_OK && range.voids < range.samples &&
+        !(range.low >= (float)rule->low && range.high <= (float)rule->high))
         return tl_fail(error, TL_ERROR_DATA, "%s: holds %g ... %g, but %s must be from %g to %g; is it the right band?",
-                       map->info.name, (double)range.low, (double)range.high, what, low, high);
+                       map->info.name, (double)range.low, (double)range.high, rule->what, rule->low, rule->high);
     if (status == TL_OK)
-        out->least = fmin(fallback, (double)range.low);
+        out->least = fmax(fmin(fallback, (double)range.low), rule->nearest_low);
     return status;
 }
 
@@ -115,8 +120,8 @@ static tl_status sheet_read(const scene_field_map *map, fbm_window window, sheet
         return tl_fail_memory(error, info->name);
     tl_status status = tl_source_read(map->source, info->level, out->window, out->numbers, error);
     for (int64_t k = 0; status == TL_OK && k < out->window.width * out->window.height; k++)
-        if (isnan(out->numbers[k]))
-            out->numbers[k] = (float)map->fallback;
+        out->numbers[k] = isnan(out->numbers[k]) ? (float)map->fallback
+                                                 : fminf(fmaxf(out->numbers[k], (float)map->low), (float)map->high);
     return status;
 }
 

@@ -11,13 +11,20 @@ typedef struct scene_field_map {
     int64_t turn;    /* columns of the model after which they come again; 0: they do not */
     double fallback; /* where the map is void */
     double least;    /* of its numbers and `fallback` */
+    double low, high;
 } scene_field_map;
 
+/* What numbers are called in messages, what a map may hold, and the range that they are brought to. */
+typedef struct scene_field_map_rule {
+    const char *what; /* "Hurst exponents" */
+    double low, high;
+    double nearest_low, nearest_high;
+} scene_field_map_rule;
+
 /* Lays a map over a model: by place where both are located, which must be in one CRS (as far as that is known); else
- * it covers the model from edge to edge. Every number must be from `low` to `high`, for which the map is read once.
- * `what`: "Hurst exponents", for messages. `map` NULL: none. */
-tl_status scene_field_map_open(const tl_source *map, const tl_source_info *model, const char *what, double low,
-                               double high, double fallback, const tl_run *run, scene_field_map *out, tl_error *error);
+ * it covers the model from edge to edge. The map is read once to see whether it keeps the rule. `map` NULL: none. */
+tl_status scene_field_map_open(const tl_source *map, const tl_source_info *model, const scene_field_map_rule *rule,
+                               double fallback, const tl_run *run, scene_field_map *out, tl_error *error);
 /* Numbers at a window of the model's samples, which may reach beyond it, without gaps: bilinear between the map's
  * samples, beyond them as at its rim. */
 tl_status scene_field_map_read(const scene_field_map *map, fbm_window window, float *out, tl_error *error);

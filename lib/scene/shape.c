@@ -208,4 +208,5 @@ void scene_chain_finish(scene_chain *chain)
     free(chain->tables);
     free(chain->row_tables);
     free(chain->place_values);
+    free(chain->place_rows);
 }
