@@ -133,10 +133,11 @@ json_t *lod_stats_json(const tl_lod_stats *s)
 {
     json_t *culled = json_pack("{s:o, s:o, s:o, s:o}", "frustum", count(s->culled[0]), "back", count(s->culled[1]),
                                "horizon", count(s->culled[2]), "ridge", count(s->culled[3]));
-    return json_pack("{s:o, s:o, s:o, s:o, s:o, s:o, s:o, s:o, s:o, s:o, s:i, s:o, s:f}", "triangles",
+    return json_pack("{s:o, s:o, s:o, s:o, s:o, s:o, s:o, s:o, s:o, s:o, s:o, s:i, s:o, s:f}", "triangles",
                      count(s->triangles), "vertices", count(s->vertices), "visited", count(s->visited), "split",
-                     count(s->split), "culled", culled, "tiles_made", count(s->tiles_made), "tiles_used",
-                     count(s->tiles_used), "samples_made", count(s->samples_made), "dem_blocks", count(s->dem_blocks),
-                     "dem_samples", count(s->dem_samples), "finest_level", s->finest_level, "pixel_error",
-                     isfinite(s->pixel_error) ? json_real(s->pixel_error) : json_null(), "seconds", s->seconds);
+                     count(s->split), "merged", count(s->merged), "culled", culled, "tiles_made", count(s->tiles_made),
+                     "tiles_used", count(s->tiles_used), "samples_made", count(s->samples_made), "dem_blocks",
+                     count(s->dem_blocks), "dem_samples", count(s->dem_samples), "finest_level", s->finest_level,
+                     "pixel_error", isfinite(s->pixel_error) ? json_real(s->pixel_error) : json_null(), "seconds",
+                     s->seconds);
 }

@@ -722,6 +722,10 @@ typedef struct tl_view_key {
 TL_API tl_status tl_view_path_read(const char *path, tl_view_key **keys, size_t *count, tl_error *error);
 /* The same for a file of one view. */
 TL_API tl_status tl_view_read(const char *path, tl_view *out, tl_error *error);
+/* `frames` views along the smooth curve through the keys, from the first to the last, at equal steps of their times or,
+ * where these are NaN, at equal steps of the way. Keys must agree in all that is no number, and in the viewport. */
+TL_API tl_status tl_view_path_sample(const tl_view_key *keys, size_t count, size_t frames, tl_view *out,
+                                     tl_error *error);
 
 /* Ways to choose the triangles. */
 typedef enum tl_selector {

@@ -1,0 +1,271 @@
+#include "cmd/command.h"
+#include "cmd/lod_options.h"
+#include "cmd/view_options.h"
+
+#include <errno.h>
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+enum { MOST_FRAMES = 1000000, NAME = 4096 };
+
+typedef struct settings {
+    common common;
+    view_options view; /* what goes before the path's own */
+    lod_options lod;
+    int frame;
+    int64_t frames; /* 0: by the path's times, or DEFAULT_FRAMES */
+    double rate;
+    bool json, csv, frames_given;
+} settings;
+
+enum { DEFAULT_FRAMES = 250 };
+
+/* ---- The path ---- */
+
+typedef struct flight {
+    tl_view *views;
+    size_t count;
+} flight;
+
+static size_t frame_count(const settings *set, const tl_view_key *keys, size_t count)
+{
+    if (set->frames_given)
+        return (size_t)set->frames;
+    double seconds = keys[count - 1].time - keys[0].time;
+    return isnan(seconds) ? DEFAULT_FRAMES : (size_t)fmin(floor(seconds * set->rate + 1e-9) + 1, MOST_FRAMES);
+}
+
+static tl_status read_path(const settings *set, flight *out, tl_error *error)
+{
+    tl_view_key *keys = NULL;
+    size_t count = 0;
+    tl_status status = tl_view_path_read(set->view.camera, &keys, &count, error);
+    if (status != TL_OK)
+        return status;
+    for (size_t k = 0; k < count; k++)
+        view_options_apply(&set->view, &keys[k].view);
+    out->count = frame_count(set, keys, count);
+    out->views = calloc(out->count, sizeof *out->views);
+    if (out->views)
+        status = tl_view_path_sample(keys, count, out->count, out->views, error);
+    else {
+        error->status = status = TL_ERROR_MEMORY;
+        snprintf(error->text, sizeof error->text, "%s: not enough memory for its frames", set->view.camera);
+    }
+    free(keys);
+    return status;
+}
+
+/* ---- Frames ---- */
+
+/* Whether a name has one number in it, as %d or %04d, and no other %. */
+static bool is_pattern(const char *name)
+{
+    const char *percent = strchr(name, '%');
+    if (!percent || strchr(percent + 1, '%'))
+        return false;
+    const char *at = percent + 1;
+    while (*at >= '0' && *at <= '9')
+        at++;
+    return *at == 'd' && at - percent <= 4;
+}
+
+/* The pattern with its number; written here, as it comes from outside. */
+static bool frame_name(const char *pattern, size_t frame, char name[NAME])
+{
+    const char *percent = strchr(pattern, '%');
+    int width = atoi(percent + 1), zero = percent[1] == '0';
+    const char *rest = strchr(percent, 'd') + 1;
+    int written = zero ? snprintf(name, NAME, "%.*s%0*zu%s", (int)(percent - pattern), pattern, width, frame, rest)
+                       : snprintf(name, NAME, "%.*s%*zu%s", (int)(percent - pattern), pattern, width, frame, rest);
+    return written > 0 && written < NAME;
+}
+
+/* What is kept over the frames. */
+typedef struct journey {
+    const settings *set;
+    const lod_ground *ground;
+    const tl_run *run;
+    tl_roam *roam; /* NULL: frames start from nothing */
+    json_t *list;  /* statistics; NULL: not wanted */
+} journey;
+
+static tl_status write_frame(const journey *j, const tl_mesh *mesh, size_t frame, tl_error *error)
+{
+    char name[NAME];
+    const tl_write_options writing = {
+        .overwrite = j->set->common.overwrite, .frame = (tl_frame)j->set->frame, .run = j->run};
+    if (frame_name(j->set->common.output, frame, name))
+        return tl_write_mesh(mesh, name, &writing, error);
+    error->status = TL_ERROR_ARGUMENT;
+    snprintf(error->text, sizeof error->text, "%.200s: the frames' names are too long", j->set->common.output);
+    return error->status;
+}
+
+static tl_status fly_frame(const journey *j, const tl_view *view, size_t frame, tl_lod_stats *stats, tl_error *error)
+{
+    const lod_ground *g = j->ground;
+    tl_mesh *mesh = NULL;
+    tl_status status;
+    if (j->roam) {
+        status = tl_roam_look(j->roam, view, stats, error);
+        if (status == TL_OK && j->set->common.output)
+            status = tl_roam_mesh(j->roam, &mesh, error);
+    } else
+        status = tl_select(g->field, g->opened.source, g->pyramid, view, &j->set->lod.lod, &mesh, stats, error);
+    if (status == TL_OK && j->set->common.output)
+        status = write_frame(j, mesh, frame, error);
+    tl_mesh_destroy(mesh);
+    return status;
+}
+
+static void tell_frame(const journey *j, size_t frame, const tl_lod_stats *s)
+{
+    if (j->list) {
+        json_t *item = lod_stats_json(s);
+        json_object_set_new(item, "frame", json_integer((json_int_t)frame));
+        json_array_append_new(j->list, item);
+    }
+    if (!j->set->csv)
+        return;
+    if (!frame)
+        printf("frame,triangles,vertices,visited,split,merged,tiles_made,samples_made,dem_blocks,finest_level,"
+               "pixel_error,seconds\n");
+    printf("%zu,%llu,%llu,%llu,%llu,%llu,%llu,%llu,%llu,%d,%.6g,%.6f\n", frame, (unsigned long long)s->triangles,
+           (unsigned long long)s->vertices, (unsigned long long)s->visited, (unsigned long long)s->split,
+           (unsigned long long)s->merged, (unsigned long long)s->tiles_made, (unsigned long long)s->samples_made,
+           (unsigned long long)s->dem_blocks, s->finest_level, s->pixel_error, s->seconds);
+}
+
+static void report(const settings *set, size_t frames, double first, double others, uint64_t triangles)
+{
+    double steady = frames > 1 ? others / (double)(frames - 1) : 0;
+    command_say(&set->common, "%zu frames, %.0f triangles each; %.4f s for the first, %.4f s for each of the others",
+                frames, (double)triangles / (double)frames, first, steady);
+}
+
+static int fly_all(const journey *j, const flight *path, progress *bar)
+{
+    tl_error error;
+    double first = 0, others = 0;
+    uint64_t triangles = 0;
+    for (size_t k = 0; k < path->count; k++) {
+        tl_lod_stats stats;
+        if (fly_frame(j, &path->views[k], k, &stats, &error) != TL_OK)
+            return command_failed(bar, &error);
+        tell_frame(j, k, &stats);
+        *(k ? &others : &first) += stats.seconds;
+        triangles += stats.triangles;
+        if (j->run->progress)
+            j->run->progress(j->run->user, k + 1, path->count);
+    }
+    progress_end(bar);
+    report(j->set, path->count, first, others, triangles);
+    return EXIT_DONE;
+}
+
+static int start(const settings *set, const lod_ground *ground, const flight *path, const tl_run *run, progress *bar)
+{
+    tl_error error;
+    journey j = {.set = set, .ground = ground, .run = run};
+    if (set->lod.lod.selector == TL_SELECTOR_ROAM) {
+        j.roam = tl_roam_create(ground->field, ground->opened.source, ground->pyramid, &set->lod.lod, &error);
+        if (!j.roam)
+            return command_failed(bar, &error);
+    }
+    j.list = set->json ? json_array() : NULL;
+    progress_stage(bar, "flying");
+    int status = fly_all(&j, path, bar);
+    tl_roam_destroy(j.roam);
+    if (status == EXIT_DONE && j.list) {
+        json_t *root = json_pack("{s:O}", "frames", j.list);
+        if (json_dumpf(root, stdout, JSON_INDENT(2)) == 0)
+            putchar('\n');
+        json_decref(root);
+    }
+    json_decref(j.list);
+    return status == EXIT_DONE ? command_done() : status;
+}
+
+static int fly(settings *set, const arguments *inputs)
+{
+    progress bar;
+    tl_error error;
+    tl_run run = command_run(&set->common, &bar);
+    lod_ground ground;
+    flight path = {0};
+    progress_stage(&bar, "measuring");
+    if (read_path(set, &path, &error) != TL_OK || lod_ground_open(&set->common, &set->lod, inputs, (tl_frame)set->frame,
+                                                                  set->common.output, &run, &ground, &error) != TL_OK) {
+        free(path.views);
+        return command_failed(&bar, &error);
+    }
+    int status = start(set, &ground, &path, &run, &bar);
+    lod_ground_close(&ground);
+    free(path.views);
+    return status;
+}
+
+static bool settings_ok(settings *set)
+{
+    if (!set->view.camera) {
+        complain("a path is wanted: --camera with a file of several views");
+        return false;
+    }
+    if (!view_options_ok(&set->view) || !lod_options_ok(&set->lod))
+        return false;
+    if (set->json && set->csv) {
+        complain("--json and --csv both go to standard output; give one");
+        return false;
+    }
+    if (set->common.output && !is_pattern(set->common.output)) {
+        complain("-o: a name with the frame's number in it is wanted, as frame%%04d.glb, not '%s'", set->common.output);
+        return false;
+    }
+    return !set->common.output || command_output_ok(&set->common, false, true);
+}
+
+static int run(const command *self, int argc, const char **argv, bool help)
+{
+    settings set = {.lod = {.levels = 6, .selector = TL_SELECTOR_ROAM}, .rate = 25};
+    const option flying[] = {
+        {"path", 0, OPTION_TEXT, &set.view.camera, NULL, "FILE",
+         "keyframes: a JSON of views, or a glTF of cameras; see talus(1)", 0, 0, NULL},
+        {"frames", 0, OPTION_INTEGER, &set.frames, &set.frames_given, "N",
+         "frames from the first view to the last, 1...1e6 (default: by the views' times; 250 without)", 1, MOST_FRAMES,
+         NULL},
+        {"fps", 0, OPTION_NUMBER, &set.rate, NULL, "R",
+         "frames a second of the views' times, 0.01...1000 (default: 25)", .01, 1000, NULL},
+        {0}};
+    const option place[] = {VIEW_OPTIONS(set.view), {0}};
+    const option depth[] = {LOD_OPTIONS(set.lod), {0}};
+    const option detail[] = {DETAIL_OPTIONS(set.lod), {0}};
+    const option input[] = {COMMON_INPUT(set.common), {0}};
+    const option output[] = {
+        COMMON_OUTPUT(set.common),
+        {"frame", 0, OPTION_CHOICE, &set.frame, NULL, "FRAME",
+         "coordinates of the meshes (default: enu where the CRS is known)", 0, 0, frame_names},
+        {"json", 0, OPTION_FLAG, &set.json, NULL, NULL, "print each frame's statistics as JSON", 0, 0, NULL},
+        {"csv", 0, OPTION_FLAG, &set.csv, NULL, NULL, "print them as a table", 0, 0, NULL},
+        {0}};
+    const option running[] = {COMMON_RUNNING(set.common), {0}};
+    const option_group groups[] = {{"Flight", flying}, {"View", place},    {"Depth", depth},     {"Detail", detail},
+                                   {"Input", input},   {"Output", output}, {"Running", running}, {0}};
+    arguments rest;
+    int status;
+    if (!command_begin(self, argc, argv, help, groups, -1, &rest, &status))
+        return status;
+    status = settings_ok(&set) ? fly(&set, &rest) : EXIT_USAGE;
+    arguments_free(&rest);
+    return status;
+}
+
+const command command_fly = {
+    "fly", "choose the triangles of every frame of a flight", "DEM... --path FILE [-o FRAME%04d.glb]",
+    "Views between the keyframes lie on a smooth curve: at their times, or, without times, at constant speed. With\n"
+    "roam, the default, a frame costs what has changed since the one before. Nothing is written without "
+    "-o.\n\n" INPUT_NOTES "\n\n"
+    "Example: talus fly dem.tif --path keyframes.json --frames 300 --csv",
+    run};
