@@ -210,7 +210,7 @@ static tl_status bracket(double least, int first, int step, int *good, int *bad,
         if (fits == up || (fits && k == first) || (!fits && k == LARGEST))
             break;
         k = up ? (k + step < LARGEST ? k + step : LARGEST) : (k - step > first ? k - step : first);
-        step *= 2;
+        step = 2 * step < STEPS ? 2 * step : STEPS;
         status = try(context, error_at(k, least), &fits, error);
     }
     return status;

@@ -429,8 +429,11 @@ lod_verdict lod_test(const lod *l, const lod_triangle *t, int depth, unsigned ru
                        .far = (float)seen.far};
     if (can && !forced && level <= l->finest)
         out.margin = l->options->band_count ? -1 : (float)fmin(seen.margin, fabs(seen.distance - l->near * error));
-    if (l->chunks && can && !forced)
-        out.priority = wants_for_chunk(l, &s, t, &out) ? HUGE_VALF : -1;
+    if (l->chunks) {
+        bool wants = wants_for_chunk(l, &s, t, &out);
+        if (can && !forced)
+            out.priority = wants ? HUGE_VALF : -1;
+    }
     if (out.state != LOD_HIDDEN)
         out.state = (double)out.priority > l->pixel_error ? LOD_SPLIT : LOD_LEAF;
     return out;
