@@ -65,9 +65,9 @@ scene_skyline *scene_skyline_create(const scene_view *view, tl_error *error);
 void scene_skyline_destroy(scene_skyline *skyline);
 /* Ground that is certainly there: at least `low` high over the whole extent. */
 void scene_skyline_raise(scene_skyline *skyline, const scene_view *view, const scene_extent *extent);
-/* Ground with holes: sight lines may come from below behind it, so that what is farther, in its azimuths, hides nothing.
- * Also fed from near to far, and before ground that is not nearer. For callers who know where the holes are, and so say
- * of the view's ground that it has none. */
+/* Ground with holes: sight lines may come from below behind it, so that what is farther, in its azimuths, hides
+ * nothing. Also fed from near to far, and before ground that is not nearer. For callers who know where the holes are,
+ * and so say of the view's ground that it has none. */
 void scene_skyline_leak(scene_skyline *skyline, const scene_box *box);
 /* Whether all of the extent is below the skyline of what is nearer than its nearest point. */
 bool scene_skyline_hides(const scene_skyline *skyline, const scene_view *view, const scene_extent *extent,
