@@ -395,7 +395,7 @@ static bool wants_for_chunk(const lod *l, const subject *s, const lod_triangle *
             *out = (lod_verdict){.state = LOD_HIDDEN, .rule = (unsigned char)hidden};
     }
     out->step = (signed char)(step + 1);
-    return step < 0 || stage >= step;
+    return (step < 0 || stage >= step) && level_of(l, s->depth) <= l->finest;
 }
 
 lod_verdict lod_test(const lod *l, const lod_triangle *t, int depth, unsigned rules)

@@ -1,0 +1,682 @@
+#include "lib/scene/view.h"
+#include "lib/talus.h"
+
+#include <math.h>
+#include <setjmp.h>
+#include <stdarg.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include <cmocka.h>
+
+/* ---- Worlds ---- */
+
+static uint32_t next_random(uint32_t *state)
+{
+    *state = *state * 1664525U + 1013904223U;
+    return *state >> 8;
+}
+
+static double uniform(uint32_t *state, double low, double high)
+{
+    return low + (high - low) * (double)next_random(state) / 16777216;
+}
+
+enum { VOIDS_NONE, VOIDS_FEW, VOIDS_MANY, VOIDS_CHECKERS, VOIDS_ALL, VOID_KINDS };
+
+/* A model with all that a view needs. */
+typedef struct world {
+    int width, height, levels;
+    float *heights;
+    tl_source *dem, *field;
+    tl_pyramid *pyramid;
+} world;
+
+static bool make_void(int kind, int i, int j, uint32_t *state)
+{
+    switch (kind) {
+    case VOIDS_FEW:
+        return next_random(state) % 97 == 0;
+    case VOIDS_MANY:
+        return next_random(state) % 4 == 0;
+    case VOIDS_CHECKERS:
+        return (i + j) & 1;
+    default:
+        return kind == VOIDS_ALL;
+    }
+}
+
+/* Hills of 100 and noise of 5 units on cells of `cell` metres. */
+static world make_world(int width, int height, int levels, int voids, double cell, uint32_t seed)
+{
+    tl_error error;
+    world w = {.width = width, .height = height, .levels = levels};
+    w.heights = malloc((size_t)(width * height) * sizeof *w.heights);
+    for (int j = 0; j < height; j++)
+        for (int i = 0; i < width; i++) {
+            double z = 100 * sin(i * .11) * cos(j * .07) + uniform(&seed, 0, 5);
+            w.heights[j * width + i] = make_void(voids, i, j, &seed) ? NAN : (float)z;
+        }
+    tl_source_info info = {
+        .width = width,
+        .height = height,
+        .type = TL_RASTER_POINT,
+        .has_voids = voids != VOIDS_NONE,
+        .name = "hills",
+        .georef = {.transform = {0, 1, 0, 0, 0, -1}, .cell_x = cell, .cell_y = cell, .height_unit = 1}};
+    w.dem = tl_array_source_create(w.heights, &info, &error);
+    tl_field_options options = {.levels = levels,
+                                .support = TL_SUPPORT_POINT,
+                                .hurst_given = true,
+                                .hurst = .8,
+                                .delta_given = true,
+                                .delta = 5,
+                                .seed = 3};
+    w.field = tl_field_create(w.dem, &options, &error);
+    w.pyramid = tl_pyramid_create(w.dem, NULL, &error);
+    assert_non_null(w.field);
+    assert_non_null(w.pyramid);
+    return w;
+}
+
+static void free_world(world *w)
+{
+    tl_source_destroy(w->field);
+    tl_pyramid_destroy(w->pyramid);
+    tl_source_destroy(w->dem);
+    free(w->heights);
+}
+
+/* A view from above the middle; positions are columns and negative rows. */
+static tl_view view_over(const world *w, double heading, double pitch, double height)
+{
+    return (tl_view){.eye = {.5 * w->width, -.5 * w->height, height},
+                     .heading = heading,
+                     .pitch = pitch,
+                     .fov = 75,
+                     .width = 640,
+                     .height = 400};
+}
+
+static tl_view random_view(const world *w, uint32_t *state)
+{
+    tl_view v = view_over(w, uniform(state, 0, 360), uniform(state, -80, 10), uniform(state, 120, 400));
+    v.eye[0] = uniform(state, 0, w->width);
+    v.eye[1] = -uniform(state, 0, w->height);
+    v.fov = uniform(state, 30, 130);
+    return v;
+}
+
+static tl_mesh *select_view(const world *w, const tl_view *view, const tl_lod_options *options, tl_lod_stats *stats)
+{
+    tl_error error = {0};
+    tl_mesh *mesh = NULL;
+    if (tl_select(w->field, w->dem, w->pyramid, view, options, &mesh, stats, &error) != TL_OK)
+        fail_msg("%s", error.text);
+    return mesh;
+}
+
+/* ---- Meshes ---- */
+
+static int by_number(const void *a, const void *b)
+{
+    uint64_t one = *(const uint64_t *)a, two = *(const uint64_t *)b;
+    return one < two ? -1 : one > two;
+}
+
+static uint64_t place_key(int64_t i, int64_t j)
+{
+    return (uint64_t)(uint32_t)i << 32 | (uint32_t)j;
+}
+
+/* Edges, each as its lower and higher vertex. */
+static uint64_t *edges_of(const tl_mesh *m)
+{
+    uint64_t *edges = malloc((3 * m->triangle_count + 1) * sizeof *edges);
+    for (size_t t = 0; t < m->triangle_count; t++)
+        for (int k = 0; k < 3; k++) {
+            uint64_t a = m->indices[3 * t + (size_t)k], b = m->indices[3 * t + (size_t)(k + 1) % 3];
+            edges[3 * t + (size_t)k] = a < b ? a << 32 | b : b << 32 | a;
+        }
+    qsort(edges, 3 * m->triangle_count, sizeof *edges, by_number);
+    return edges;
+}
+
+static uint64_t *places_of(const tl_mesh *m)
+{
+    uint64_t *places = malloc((m->vertex_count + 1) * sizeof *places);
+    for (size_t k = 0; k < m->vertex_count; k++)
+        places[k] = place_key(m->vertices[k].i, m->vertices[k].j);
+    qsort(places, m->vertex_count, sizeof *places, by_number);
+    return places;
+}
+
+/* The lattice's edges are split in their middles, so a crack is an edge with one side whose middle is a vertex. */
+static void expect_no_cracks(const tl_mesh *m)
+{
+    uint64_t *edges = edges_of(m), *places = places_of(m);
+    for (size_t k = 1; k < m->vertex_count; k++)
+        assert_int_not_equal(places[k], places[k - 1]);
+    for (size_t k = 0, end; k < 3 * m->triangle_count; k = end) {
+        for (end = k + 1; end < 3 * m->triangle_count && edges[end] == edges[k]; end++)
+            ;
+        assert_true(end - k <= 2);
+        const tl_vertex *a = &m->vertices[edges[k] >> 32], *b = &m->vertices[(uint32_t)edges[k]];
+        if (end - k == 2 || ((a->i + b->i) | (a->j + b->j)) & 1)
+            continue;
+        uint64_t middle = place_key((a->i + b->i) / 2, (a->j + b->j) / 2);
+        assert_null(bsearch(&middle, places, m->vertex_count, sizeof *places, by_number));
+    }
+    free(edges);
+    free(places);
+}
+
+/* Triangles face up, and have known corners on the field. */
+static void expect_sound(const world *w, const tl_mesh *m)
+{
+    tl_error error;
+    for (size_t t = 0; t < m->triangle_count; t++) {
+        const uint32_t *n = m->indices + 3 * t;
+        const tl_vertex *a = &m->vertices[n[0]], *b = &m->vertices[n[1]], *c = &m->vertices[n[2]];
+        int64_t area = (int64_t)(b->i - a->i) * (c->j - a->j) - (int64_t)(b->j - a->j) * (c->i - a->i);
+        assert_true(area < 0);
+    }
+    for (size_t k = 0; k < m->vertex_count; k += 1 + m->vertex_count / 200) {
+        float z;
+        const tl_vertex *v = &m->vertices[k];
+        assert_int_equal(tl_source_read(w->field, w->levels, (tl_window){v->i, v->j, 1, 1}, &z, &error), TL_OK);
+        assert_memory_equal(&z, &v->z, sizeof z);
+    }
+}
+
+/* Each triangle by its corners' places, the lowest first. */
+typedef struct corners {
+    uint64_t at[3];
+} corners;
+
+static int by_corners(const void *a, const void *b)
+{
+    return memcmp(a, b, sizeof(corners));
+}
+
+static corners *corners_of(const tl_mesh *m)
+{
+    corners *out = malloc((m->triangle_count + 1) * sizeof *out);
+    for (size_t t = 0; t < m->triangle_count; t++) {
+        uint64_t at[3];
+        for (int k = 0; k < 3; k++) {
+            const tl_vertex *v = &m->vertices[m->indices[3 * t + (size_t)k]];
+            at[k] = place_key(v->i, v->j);
+        }
+        int first = at[0] < at[1] ? (at[0] < at[2] ? 0 : 2) : at[1] < at[2] ? 1 : 2;
+        for (int k = 0; k < 3; k++)
+            out[t].at[k] = at[(first + k) % 3];
+    }
+    qsort(out, m->triangle_count, sizeof *out, by_corners);
+    return out;
+}
+
+static void expect_same_triangles(const tl_mesh *a, const tl_mesh *b)
+{
+    assert_int_equal(a->triangle_count, b->triangle_count);
+    corners *one = corners_of(a), *two = corners_of(b);
+    assert_memory_equal(one, two, a->triangle_count * sizeof *one);
+    free(one);
+    free(two);
+}
+
+static void expect_same_bytes(const tl_mesh *a, const tl_mesh *b)
+{
+    assert_int_equal(a->triangle_count, b->triangle_count);
+    assert_int_equal(a->vertex_count, b->vertex_count);
+    assert_memory_equal(a->vertices, b->vertices, a->vertex_count * sizeof *a->vertices);
+    assert_memory_equal(a->indices, b->indices, 3 * a->triangle_count * sizeof *a->indices);
+}
+
+/* ---- Cracks ---- */
+
+static void noCracksAnywhere(void **state)
+{
+    (void)state;
+    uint32_t seed = 11;
+    size_t drawn = 0;
+    for (int round = 0; round < 60; round++) {
+        world w = make_world(2 + (int)(next_random(&seed) % 60), 2 + (int)(next_random(&seed) % 60),
+                             (int)(next_random(&seed) % 4), round % VOID_KINDS, 10, seed);
+        for (int selector = 0; selector < 3; selector++) {
+            tl_view view = random_view(&w, &seed);
+            tl_lod_options options = {.selector = (tl_selector)selector,
+                                      .pixel_error = exp(uniform(&seed, -1, 6)),
+                                      .keep = next_random(&seed) % 16};
+            tl_mesh *mesh = select_view(&w, &view, &options, NULL);
+            expect_no_cracks(mesh);
+            expect_sound(&w, mesh);
+            drawn += mesh->triangle_count;
+            tl_mesh_destroy(mesh);
+        }
+        free_world(&w);
+    }
+    assert_true(drawn > 100000);
+}
+
+/* With everything kept and no detail, what is drawn is what the framework draws: no void is filled or widened. */
+static void voidsAreThoseOfTheFramework(void **state)
+{
+    (void)state;
+    for (int kind = 0; kind < VOID_KINDS; kind++) {
+        tl_error error;
+        world w = make_world(43, 37, 0, kind, 10, 5);
+        tl_selection selection = {.max_error = 0};
+        tl_framework *framework = tl_framework_from_pyramid(w.pyramid, w.dem, &selection, &error);
+        tl_mesh *expected = NULL;
+        assert_int_equal(tl_framework_mesh(framework, &expected, &error), TL_OK);
+        tl_view view = view_over(&w, 0, -30, 300);
+        tl_lod_options options = {.pixel_error = 1e-9, .keep = 15};
+        tl_mesh *mesh = select_view(&w, &view, &options, NULL);
+        if (kind != VOIDS_CHECKERS && tl_framework_isolated_count(framework) == 0 && kind != VOIDS_MANY)
+            expect_same_triangles(mesh, expected); /* the framework ties in what lies alone among voids */
+        else
+            assert_true(mesh->triangle_count <= expected->triangle_count);
+        tl_mesh_destroy(mesh);
+        tl_mesh_destroy(expected);
+        tl_framework_destroy(framework);
+        free_world(&w);
+    }
+}
+
+/* ---- Selectors ---- */
+
+static void roamFindsWhatQuadtreeFinds(void **state)
+{
+    (void)state;
+    uint32_t seed = 23;
+    for (int round = 0; round < 24; round++) {
+        world w = make_world(10 + (int)(next_random(&seed) % 60), 10 + (int)(next_random(&seed) % 60), round % 4,
+                             round % VOID_KINDS, 10, seed);
+        tl_view view = random_view(&w, &seed);
+        tl_lod_options options = {.pixel_error = exp(uniform(&seed, 0, 5)), .keep = round % 3 ? 0 : 15};
+        if (round % 4 == 3)
+            options = (tl_lod_options){.budget = 6000};
+        tl_lod_options other = options;
+        other.selector = TL_SELECTOR_ROAM;
+        tl_mesh *a = select_view(&w, &view, &options, NULL), *b = select_view(&w, &view, &other, NULL);
+        expect_same_triangles(a, b);
+        tl_mesh_destroy(a);
+        tl_mesh_destroy(b);
+        free_world(&w);
+    }
+}
+
+static void fly(const world *w, const tl_lod_options *options, uint32_t *seed, uint64_t *again, uint64_t *nothing)
+{
+    tl_error error;
+    tl_roam *roam = tl_roam_create(w->field, w->dem, w->pyramid, options, &error);
+    assert_non_null(roam);
+    tl_view view = view_over(w, 40, -25, 250);
+    for (int frame = 0; frame < 25; frame++) {
+        tl_lod_stats kept, fresh;
+        tl_mesh *a = NULL, *b = NULL;
+        assert_int_equal(tl_roam_look(roam, &view, &kept, &error), TL_OK);
+        assert_int_equal(tl_roam_mesh(roam, &a, &error), TL_OK);
+        b = select_view(w, &view, options, &fresh);
+        expect_same_bytes(a, b);
+        expect_no_cracks(a);
+        assert_int_equal(kept.triangles, a->triangle_count);
+        *again += frame ? kept.visited : 0;
+        *nothing += frame ? fresh.visited : 0;
+        tl_mesh_destroy(a);
+        tl_mesh_destroy(b);
+        view.eye[0] += uniform(seed, 0, .05);
+        view.eye[1] += uniform(seed, -.02, .02);
+        view.heading += uniform(seed, -.1, .3);
+        if (frame % 10 == 9) { /* a cut, or another lens */
+            view.heading = uniform(seed, 0, 360);
+            view.fov = frame == 19 ? 40 : view.fov;
+        }
+    }
+    tl_roam_destroy(roam);
+}
+
+static void flightsEqualFreshStarts(void **state)
+{
+    (void)state;
+    uint32_t seed = 29;
+    uint64_t again = 0, nothing = 0;
+    for (int kind = 0; kind < VOID_KINDS; kind++) {
+        world w = make_world(66, 51, 3, kind, 10, 7);
+        const tl_lod_options options[] = {{.selector = TL_SELECTOR_ROAM, .pixel_error = 6},
+                                          {.selector = TL_SELECTOR_ROAM, .pixel_error = 20, .keep = TL_CULL_FRUSTUM}};
+        for (size_t k = 0; k < sizeof options / sizeof *options; k++)
+            fly(&w, &options[k], &seed, &again, &nothing);
+        free_world(&w);
+    }
+    assert_true(2 * again < nothing); /* that is what it is for */
+}
+
+static void flightsKeepBudgets(void **state)
+{
+    (void)state;
+    uint32_t seed = 31;
+    uint64_t again = 0, nothing = 0;
+    world w = make_world(66, 51, 3, VOIDS_FEW, 10, 7);
+    tl_lod_options options = {.selector = TL_SELECTOR_ROAM, .budget = 5000};
+    fly(&w, &options, &seed, &again, &nothing);
+    free_world(&w);
+}
+
+static void budgetsAreKept(void **state)
+{
+    (void)state;
+    world w = make_world(65, 65, 3, VOIDS_NONE, 10, 3);
+    tl_view view = view_over(&w, 30, -30, 250);
+    for (int selector = 0; selector < 3; selector++)
+        for (uint64_t budget = selector == TL_SELECTOR_CHUNK ? 3200 : 800; budget <= 12800; budget *= 2) {
+            tl_lod_options options = {.selector = (tl_selector)selector, .budget = budget};
+            tl_mesh *mesh = select_view(&w, &view, &options, NULL);
+            assert_true(mesh->triangle_count <= budget);
+            if (selector != TL_SELECTOR_CHUNK) /* where steps of pixel error are 1 %, and triangles go with them */
+                assert_true(mesh->triangle_count * 10 >= budget * 8);
+            tl_mesh_destroy(mesh);
+        }
+    free_world(&w);
+}
+
+static void budgetsBelowTheCoarsestAreRefused(void **state)
+{
+    (void)state;
+    tl_error error;
+    world w = make_world(40, 40, 1, VOIDS_MANY, 10, 3);
+    tl_view view = view_over(&w, 0, -60, 400);
+    for (int selector = 0; selector < 3; selector++) {
+        tl_lod_options options = {.selector = (tl_selector)selector, .budget = 2, .keep = 15};
+        tl_mesh *mesh = NULL;
+        assert_int_equal(tl_select(w.field, w.dem, w.pyramid, &view, &options, &mesh, NULL, &error), TL_ERROR_ARGUMENT);
+        assert_non_null(strstr(error.text, "budget"));
+        assert_null(mesh);
+    }
+    free_world(&w);
+}
+
+/* ---- Depth ---- */
+
+static void finerPixelErrorsContainCoarserOnes(void **state)
+{
+    (void)state;
+    world w = make_world(65, 65, 3, VOIDS_FEW, 10, 3);
+    tl_view view = view_over(&w, 200, -30, 250);
+    uint64_t *before = NULL;
+    size_t count = 0;
+    for (double pixels = 64; pixels > .5; pixels /= 4) {
+        tl_lod_options options = {.pixel_error = pixels, .keep = 15}; /* else a corner may come to be hidden */
+        tl_lod_stats stats;
+        tl_mesh *mesh = select_view(&w, &view, &options, &stats);
+        uint64_t *places = places_of(mesh);
+        for (size_t k = 0; k < count; k++)
+            assert_non_null(bsearch(&before[k], places, mesh->vertex_count, sizeof *places, by_number));
+        assert_true(mesh->vertex_count > count);
+        free(before);
+        before = places;
+        count = mesh->vertex_count;
+        tl_mesh_destroy(mesh);
+    }
+    free(before);
+    free_world(&w);
+}
+
+static void maxLevelIsNotPassed(void **state)
+{
+    (void)state;
+    world w = make_world(65, 65, 4, VOIDS_NONE, 10, 3);
+    tl_view view = view_over(&w, 200, -30, 250);
+    for (int selector = 0; selector < 3; selector++)
+        for (int level = -4; level <= 3; level++) {
+            tl_lod_options options = {
+                .selector = (tl_selector)selector, .pixel_error = 1e-6, .max_level_given = true, .max_level = level};
+            tl_lod_stats stats;
+            tl_mesh *mesh = select_view(&w, &view, &options, &stats);
+            int step = 16 >> level;
+            if (level < 0)
+                step = 16 << -level;
+            for (size_t k = 0; k < mesh->vertex_count; k++)
+                assert_true(mesh->vertices[k].i % step == 0 && mesh->vertices[k].j % step == 0);
+            assert_true(mesh->triangle_count > 0 && stats.finest_level <= level);
+            tl_mesh_destroy(mesh);
+        }
+    free_world(&w);
+}
+
+/* Within each band no edge is longer than the diagonal of its cells, measured to the nearest place of the triangle. */
+static void bandsSetTheCells(void **state)
+{
+    (void)state;
+    world w = make_world(65, 65, 3, VOIDS_NONE, 10, 3);
+    tl_view view = view_over(&w, 200, -30, 250);
+    const double bands[] = {260, 320, 420};
+    for (int selector = 0; selector < 3; selector++) {
+        tl_lod_options options = {
+            .selector = (tl_selector)selector, .band_count = 3, .bands = {bands[0], bands[1], bands[2]}, .keep = 15};
+        tl_mesh *mesh = select_view(&w, &view, &options, NULL);
+        size_t finest = 0, coarse = 0;
+        for (size_t t = 0; t < mesh->triangle_count; t++) {
+            double far = 0;
+            int32_t side = 0;
+            for (int k = 0; k < 3; k++) {
+                const tl_vertex *v = &mesh->vertices[mesh->indices[3 * t + (size_t)k]],
+                                *u = &mesh->vertices[mesh->indices[3 * t + (size_t)(k + 1) % 3]];
+                double x = (v->i / 8. - view.eye[0]) * 10, y = (v->j / 8. + view.eye[1]) * 10;
+                far = fmax(far, sqrt(x * x + y * y + ((double)v->z - view.eye[2]) * ((double)v->z - view.eye[2])));
+                side = (int32_t)fmax(side, fmax(abs(v->i - u->i), abs(v->j - u->j)));
+            }
+            for (int k = 0; k < 3; k++)
+                if (far <= bands[k])
+                    assert_true(side <= 1 << k);
+            finest += side == 1;
+            coarse += side > 4;
+        }
+        assert_true(finest > 0 && (coarse > 0 || selector == TL_SELECTOR_CHUNK)); /* which has no small squares */
+        expect_no_cracks(mesh);
+        tl_mesh_destroy(mesh);
+    }
+    free_world(&w);
+}
+
+/* ---- Extremes ---- */
+
+static void expect_some_end(const world *w, const tl_view *view, tl_lod_options options)
+{
+    for (int selector = 0; selector < 3; selector++) {
+        tl_error error = {0};
+        tl_mesh *mesh = NULL;
+        options.selector = (tl_selector)selector;
+        tl_status status = tl_select(w->field, w->dem, w->pyramid, view, &options, &mesh, NULL, &error);
+        if (status == TL_OK) {
+            expect_no_cracks(mesh);
+            expect_sound(w, mesh);
+        } else
+            assert_true(error.text[0]);
+        tl_mesh_destroy(mesh);
+    }
+}
+
+static void extremeViewsEndWell(void **state)
+{
+    (void)state;
+    world w = make_world(33, 33, 2, VOIDS_NONE, 10, 3);
+    const tl_lod_options usual = {.pixel_error = 4};
+    const double heights[] = {-1000, -100, 0, 100, 1e5, 1e9};
+    for (size_t k = 0; k < sizeof heights / sizeof *heights; k++)
+        for (double pitch = -90; pitch <= 90; pitch += 45) {
+            tl_view view = view_over(&w, 10, pitch, heights[k]);
+            expect_some_end(&w, &view, usual);
+        }
+    tl_view on_it = view_over(&w, 10, 0, 0);
+    on_it.above_ground = true;
+    expect_some_end(&w, &on_it, usual);
+    const double fovs[] = {.01, 179};
+    for (int k = 0; k < 2; k++) {
+        tl_view view = view_over(&w, 10, -40, 300);
+        view.fov = fovs[k];
+        expect_some_end(&w, &view, usual);
+        view.width = view.height = 1;
+        expect_some_end(&w, &view, usual);
+    }
+    tl_view view = view_over(&w, 10, -40, 300);
+    expect_some_end(&w, &view, (tl_lod_options){.pixel_error = 1e-6, .max_level_given = true, .max_level = 1});
+    expect_some_end(&w, &view, (tl_lod_options){.pixel_error = 1e6});
+    expect_some_end(&w, &view, (tl_lod_options){.budget = 2});
+    expect_some_end(&w, &view, (tl_lod_options){.budget = UINT64_C(1) << 31});
+    free_world(&w);
+}
+
+static void smallRastersEndWell(void **state)
+{
+    (void)state;
+    const int sizes[][2] = {{1, 1}, {1, 9}, {9, 1}, {2, 2}, {2, 9}, {3, 2}};
+    for (size_t k = 0; k < sizeof sizes / sizeof *sizes; k++)
+        for (int kind = 0; kind < VOID_KINDS; kind++) {
+            world w = make_world(sizes[k][0], sizes[k][1], 2, kind, 10, 3);
+            tl_view view = view_over(&w, 10, -90, 200);
+            expect_some_end(&w, &view, (tl_lod_options){.pixel_error = 1});
+            if (kind == VOIDS_NONE && sizes[k][0] > 1 && sizes[k][1] > 1) {
+                tl_mesh *mesh = select_view(&w, &view, &(tl_lod_options){.pixel_error = 1e-3}, NULL);
+                assert_int_equal(mesh->triangle_count, 2 * 16 * (sizes[k][0] - 1) * (sizes[k][1] - 1));
+                tl_mesh_destroy(mesh);
+            }
+            free_world(&w);
+        }
+}
+
+static void memoryIsKept(void **state)
+{
+    (void)state;
+    tl_error error = {0};
+    tl_mesh *mesh = NULL;
+    world w = make_world(65, 65, 4, VOIDS_NONE, 10, 3);
+    tl_view view = view_over(&w, 10, -40, 300);
+    tl_run run = {.memory = 1 << 19};
+    tl_lod_options options = {.pixel_error = 1e-3, .run = &run};
+    assert_int_equal(tl_select(w.field, w.dem, w.pyramid, &view, &options, &mesh, NULL, &error), TL_ERROR_MEMORY);
+    assert_non_null(strstr(error.text, "memory"));
+    assert_null(mesh);
+    free_world(&w);
+}
+
+static void refusesWhatItCannotTake(void **state)
+{
+    (void)state;
+    tl_error error;
+    tl_mesh *mesh = NULL;
+    world w = make_world(20, 20, 2, VOIDS_NONE, 10, 3);
+    tl_view view = view_over(&w, 10, -40, 300);
+    const tl_field_options bad[] = {{.levels = 2, .support = TL_SUPPORT_AREA},
+                                    {.levels = 2, .support = TL_SUPPORT_POINT, .scheme = "successive"}};
+    for (size_t k = 0; k < sizeof bad / sizeof *bad; k++) {
+        tl_source *field = tl_field_create(w.dem, &bad[k], &error);
+        assert_non_null(field);
+        assert_int_equal(tl_select(field, w.dem, w.pyramid, &view, NULL, &mesh, NULL, &error), TL_ERROR_ARGUMENT);
+        assert_non_null(strstr(error.text, "points"));
+        tl_source_destroy(field);
+    }
+    assert_int_equal(tl_select(w.dem, w.dem, w.pyramid, &view, NULL, &mesh, NULL, &error), TL_ERROR_ARGUMENT);
+    const tl_lod_options wrong[] = {{.pixel_error = -1},
+                                    {.pixel_error = NAN},
+                                    {.pixel_error = INFINITY},
+                                    {.band_count = 2, .bands = {5, 5}},
+                                    {.band_count = 1, .bands = {NAN}},
+                                    {.band_count = 1, .bands = {5}, .budget = 100}};
+    for (size_t k = 0; k < sizeof wrong / sizeof *wrong; k++)
+        assert_int_equal(tl_select(w.field, w.dem, w.pyramid, &view, &wrong[k], &mesh, NULL, &error),
+                         TL_ERROR_ARGUMENT);
+    assert_null(mesh);
+    free_world(&w);
+}
+
+static void threadsChangeNoByte(void **state)
+{
+    (void)state;
+    world w = make_world(90, 70, 3, VOIDS_FEW, 10, 3);
+    tl_view view = view_over(&w, 10, -40, 300);
+    for (int selector = 0; selector < 3; selector++) {
+        tl_run one = {.threads = 1}, many = {.threads = 5};
+        tl_lod_options a = {.selector = (tl_selector)selector, .pixel_error = 2, .run = &one}, b = a;
+        b.run = &many;
+        tl_mesh *first = select_view(&w, &view, &a, NULL), *second = select_view(&w, &view, &b, NULL);
+        expect_same_bytes(first, second);
+        tl_mesh_destroy(first);
+        tl_mesh_destroy(second);
+    }
+    free_world(&w);
+}
+
+/* ---- Paths ---- */
+
+static void pathsPassTheirKeys(void **state)
+{
+    (void)state;
+    tl_error error;
+    tl_view views[9];
+    tl_view_key keys[3] = {{.time = 0, .view = {.eye = {179.9, 10, 500}, .heading = 350, .pitch = -5, .fov = 50}},
+                           {.time = 1, .view = {.eye = {-179.9, 11, 700}, .heading = 10, .pitch = -15, .fov = 60}},
+                           {.time = 2, .view = {.eye = {-179.7, 12, 600}, .heading = 40, .pitch = -10, .fov = 70}}};
+    assert_int_equal(tl_view_path_sample(keys, 3, 9, views, &error), TL_OK);
+    for (int k = 0; k < 3; k++) {
+        double turns = (views[4 * k].eye[0] - keys[k].view.eye[0]) / 360,
+               heading = (views[4 * k].heading - keys[k].view.heading) / 360;
+        assert_true(fabs(turns - round(turns)) < 1e-12 && fabs(heading - round(heading)) < 1e-12);
+        assert_true(fabs(views[4 * k].eye[2] - keys[k].view.eye[2]) < 1e-9);
+    }
+    for (int f = 1; f < 9; f++) { /* the short way around */
+        assert_true(fabs(views[f].eye[0] - views[f - 1].eye[0]) < .2);
+        assert_true(fabs(views[f].heading - views[f - 1].heading) < 15);
+    }
+}
+
+static void pathsWithoutTimesHaveOneSpeed(void **state)
+{
+    (void)state;
+    enum { FRAMES = 200 };
+    tl_error error;
+    tl_view views[FRAMES];
+    tl_view_key keys[4];
+    const double x[4] = {0, 10, 400, 420}, y[4] = {0, 30, 0, 300};
+    for (int k = 0; k < 4; k++)
+        keys[k] = (tl_view_key){.time = NAN, .view = {.eye = {x[k], y[k], 100}, .projected = true}};
+    assert_int_equal(tl_view_path_sample(keys, 4, FRAMES, views, &error), TL_OK);
+    double least = HUGE_VAL, most = 0;
+    for (int f = 1; f < FRAMES; f++) {
+        double step = hypot(views[f].eye[0] - views[f - 1].eye[0], views[f].eye[1] - views[f - 1].eye[1]);
+        least = fmin(least, step);
+        most = fmax(most, step);
+    }
+    /* the way is summed up over chords of 1/64 of a key's; the curve turns by at most a few degrees in one */
+    assert_true(most < 1.03 * least);
+    keys[2].view.above_ground = true;
+    assert_int_equal(tl_view_path_sample(keys, 4, FRAMES, views, &error), TL_ERROR_ARGUMENT);
+}
+
+int main(void)
+{
+    const struct CMUnitTest tests[] = {
+        cmocka_unit_test(noCracksAnywhere),
+        cmocka_unit_test(voidsAreThoseOfTheFramework),
+        cmocka_unit_test(roamFindsWhatQuadtreeFinds),
+        cmocka_unit_test(flightsEqualFreshStarts),
+        cmocka_unit_test(flightsKeepBudgets),
+        cmocka_unit_test(budgetsAreKept),
+        cmocka_unit_test(budgetsBelowTheCoarsestAreRefused),
+        cmocka_unit_test(finerPixelErrorsContainCoarserOnes),
+        cmocka_unit_test(maxLevelIsNotPassed),
+        cmocka_unit_test(bandsSetTheCells),
+        cmocka_unit_test(extremeViewsEndWell),
+        cmocka_unit_test(smallRastersEndWell),
+        cmocka_unit_test(memoryIsKept),
+        cmocka_unit_test(refusesWhatItCannotTake),
+        cmocka_unit_test(threadsChangeNoByte),
+        cmocka_unit_test(pathsPassTheirKeys),
+        cmocka_unit_test(pathsWithoutTimesHaveOneSpeed),
+    };
+    return cmocka_run_group_tests(tests, NULL, NULL);
+}
