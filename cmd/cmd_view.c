@@ -169,8 +169,9 @@ static int run(const command *self, int argc, const char **argv, bool help)
 
 const command command_view = {
     "view", "choose the triangles that one view of refined terrain needs",
-    "DEM... --eye LON,LAT,HEIGHT [--target LON,LAT,HEIGHT] -o MESH",
+    "DEM... --eye LON,LAT,HEIGHT [--target LON,LAT,HEIGHT] [-o MESH] [--picture FILE.png]",
     "Formats: .glb, .obj, .ply, .stl. Nothing is made, read or written where it cannot be seen. The DEM's samples are\n"
     "taken for heights at points.\n\n" INPUT_NOTES "\n\n"
-    "Example: talus view dem.tif --eye 7.65,45.95,300 --above-ground --heading 200 -o view.glb",
+    "Examples: talus view dem.tif --eye -84.25,36.55,300 --above-ground --heading 120 -o view.glb\n"
+    "          talus view dem.tif --eye -84.25,36.55,300 --above-ground --heading 120 --picture view.png --measure",
     run};
