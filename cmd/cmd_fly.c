@@ -1,5 +1,6 @@
 #include "cmd/command.h"
 #include "cmd/lod_options.h"
+#include "cmd/picture_options.h"
 #include "cmd/view_options.h"
 
 #include <errno.h>
@@ -14,6 +15,8 @@ typedef struct settings {
     common common;
     view_options view; /* what goes before the path's own */
     lod_options lod;
+    picture_options picture; /* of frames that are pictures */
+    double shutter;          /* share of the time between frames in which it is open */
     int frame;
     int64_t frames; /* 0: by the path's times, or DEFAULT_FRAMES */
     double rate;
@@ -87,10 +90,61 @@ static bool frame_name(const char *pattern, size_t frame, char name[NAME])
 typedef struct journey {
     const settings *set;
     const lod_ground *ground;
+    const flight *path;
     const tl_run *run;
     tl_roam *roam; /* NULL: frames start from nothing */
     json_t *list;  /* statistics; NULL: not wanted */
 } journey;
+
+static bool draws_pictures(const settings *set)
+{
+    return set->common.output && picture_is_png(set->common.output);
+}
+
+/* The views of a frame while the shutter is open: its own, and some of those on the way to the next. */
+enum { OPEN_VIEWS = 9, FINE = 64 };
+static tl_status views_of_frame(const journey *j, size_t frame, tl_view out[OPEN_VIEWS], size_t *count, tl_error *error)
+{
+    out[0] = j->path->views[frame];
+    *count = 1;
+    if (!(j->set->shutter > 0) || frame + 1 >= j->path->count)
+        return TL_OK;
+    const tl_view_key ends[2] = {{0, out[0]}, {1, j->path->views[frame + 1]}};
+    tl_view fine[FINE + 1];
+    tl_status status = tl_view_path_sample(ends, 2, FINE + 1, fine, error);
+    for (int k = 0; k < OPEN_VIEWS && status == TL_OK; k++)
+        out[k] = fine[(int)floor(j->set->shutter * FINE * k / (OPEN_VIEWS - 1) + 0.5)];
+    *count = OPEN_VIEWS;
+    return status;
+}
+
+/* The view that triangles are chosen for: with the shutter open a sixteenth more on each side, for what comes in from
+ * there. */
+static tl_view view_for_mesh(const settings *set, const tl_view *view)
+{
+    const double degree = 3.14159265358979323846 / 180, wider = 1.125;
+    tl_view wide = *view;
+    if (!(set->shutter > 0) || !draws_pictures(set))
+        return wide;
+    int width = view->width ? view->width : 1920, height = view->height ? view->height : 1080;
+    double across = tan((view->fov > 0 ? view->fov : 60) / 2 * degree) * wider;
+    wide.fov = fmin(2 * atan(across) / degree, 179);
+    wide.width = (int)fmin(ceil(width * wider), 32768);
+    wide.height = (int)fmin(ceil(height * wider), 32768);
+    return wide;
+}
+
+static tl_status draw_frame(const journey *j, const tl_mesh *mesh, size_t frame, const char *name, tl_error *error)
+{
+    tl_view views[OPEN_VIEWS];
+    size_t count;
+    tl_view_picture_options look = j->set->picture.look;
+    look.overwrite = j->set->common.overwrite;
+    look.run = j->run;
+    tl_status status = views_of_frame(j, frame, views, &count, error);
+    return status == TL_OK ? tl_view_write_picture(mesh, j->ground->opened.source, views, count, name, &look, error)
+                           : status;
+}
 
 static tl_status write_frame(const journey *j, const tl_mesh *mesh, size_t frame, tl_error *error)
 {
@@ -98,7 +152,8 @@ static tl_status write_frame(const journey *j, const tl_mesh *mesh, size_t frame
     const tl_write_options writing = {
         .overwrite = j->set->common.overwrite, .frame = (tl_frame)j->set->frame, .run = j->run};
     if (frame_name(j->set->common.output, frame, name))
-        return tl_write_mesh(mesh, name, &writing, error);
+        return draws_pictures(j->set) ? draw_frame(j, mesh, frame, name, error)
+                                      : tl_write_mesh(mesh, name, &writing, error);
     error->status = TL_ERROR_ARGUMENT;
     snprintf(error->text, sizeof error->text, "%.200s: the frames' names are too long", j->set->common.output);
     return error->status;
@@ -107,14 +162,15 @@ static tl_status write_frame(const journey *j, const tl_mesh *mesh, size_t frame
 static tl_status fly_frame(const journey *j, const tl_view *view, size_t frame, tl_lod_stats *stats, tl_error *error)
 {
     const lod_ground *g = j->ground;
+    const tl_view wide = view_for_mesh(j->set, view);
     tl_mesh *mesh = NULL;
     tl_status status;
     if (j->roam) {
-        status = tl_roam_look(j->roam, view, stats, error);
+        status = tl_roam_look(j->roam, &wide, stats, error);
         if (status == TL_OK && j->set->common.output)
             status = tl_roam_mesh(j->roam, &mesh, error);
     } else
-        status = tl_select(g->field, g->opened.source, g->pyramid, view, &j->set->lod.lod, &mesh, stats, error);
+        status = tl_select(g->field, g->opened.source, g->pyramid, &wide, &j->set->lod.lod, &mesh, stats, error);
     if (status == TL_OK && j->set->common.output)
         status = write_frame(j, mesh, frame, error);
     tl_mesh_destroy(mesh);
@@ -169,7 +225,7 @@ static int fly_all(const journey *j, const flight *path, progress *bar)
 static int start(const settings *set, const lod_ground *ground, const flight *path, const tl_run *run, progress *bar)
 {
     tl_error error;
-    journey j = {.set = set, .ground = ground, .run = run};
+    journey j = {.set = set, .ground = ground, .path = path, .run = run};
     if (set->lod.lod.selector == TL_SELECTOR_ROAM) {
         j.roam = tl_roam_create(ground->field, ground->opened.source, ground->pyramid, &set->lod.lod, &error);
         if (!j.roam)
@@ -214,7 +270,7 @@ static bool settings_ok(settings *set)
         complain("a path is wanted: --camera with a file of several views");
         return false;
     }
-    if (!view_options_ok(&set->view) || !lod_options_ok(&set->lod))
+    if (!view_options_ok(&set->view) || !lod_options_ok(&set->lod) || !picture_options_ok(&set->picture))
         return false;
     if (set->json && set->csv) {
         complain("--json and --csv both go to standard output; give one");
@@ -224,7 +280,7 @@ static bool settings_ok(settings *set)
         complain("-o: a name with the frame's number in it is wanted, as frame%%04d.glb, not '%s'", set->common.output);
         return false;
     }
-    return !set->common.output || command_output_ok(&set->common, false, true);
+    return !set->common.output || draws_pictures(set) || command_output_ok(&set->common, false, true);
 }
 
 static int run(const command *self, int argc, const char **argv, bool help)
@@ -242,6 +298,11 @@ static int run(const command *self, int argc, const char **argv, bool help)
     const option place[] = {VIEW_OPTIONS(set.view), {0}};
     const option depth[] = {LOD_OPTIONS(set.lod), {0}};
     const option detail[] = {DETAIL_OPTIONS(set.lod), {0}};
+    const option look[] = {LOOK_OPTIONS(set.picture),
+                           {"shutter", 0, OPTION_NUMBER, &set.shutter, NULL, "SHARE",
+                            "of the time to the next frame that a picture takes: motion blur, 0...1 (default: 0)", 0, 1,
+                            NULL},
+                           {0}};
     const option input[] = {COMMON_INPUT(set.common), {0}};
     const option output[] = {
         COMMON_OUTPUT(set.common),
@@ -251,8 +312,9 @@ static int run(const command *self, int argc, const char **argv, bool help)
         {"csv", 0, OPTION_FLAG, &set.csv, NULL, NULL, "print them as a table", 0, 0, NULL},
         {0}};
     const option running[] = {COMMON_RUNNING(set.common), {0}};
-    const option_group groups[] = {{"Flight", flying}, {"View", place},    {"Depth", depth},     {"Detail", detail},
-                                   {"Input", input},   {"Output", output}, {"Running", running}, {0}};
+    const option_group groups[] = {{"Flight", flying}, {"View", place},      {"Depth", depth},
+                                   {"Detail", detail}, {"Pictures", look},   {"Input", input},
+                                   {"Output", output}, {"Running", running}, {0}};
     arguments rest;
     int status;
     if (!command_begin(self, argc, argv, help, groups, -1, &rest, &status))
@@ -265,7 +327,8 @@ static int run(const command *self, int argc, const char **argv, bool help)
 const command command_fly = {
     "fly", "choose the triangles of every frame of a flight", "DEM... --path FILE [-o FRAME%04d.glb]",
     "Views between the keyframes lie on a smooth curve: at their times, or, without times, at constant speed. With\n"
-    "roam, the default, a frame costs what has changed since the one before. Nothing is written without "
-    "-o.\n\n" INPUT_NOTES "\n\n"
+    "roam, the default, a frame costs what has changed since the one before. Frames are meshes, .glb, .obj, .ply, "
+    ".stl,\n"
+    "or pictures, .png. Nothing is written without -o.\n\n" INPUT_NOTES "\n\n"
     "Example: talus fly dem.tif --path keyframes.json --frames 300 --csv",
     run};

@@ -10,9 +10,14 @@ static bool ends_with(const char *path, const char *ending)
     return length > end && strcasecmp(path + length - end, ending) == 0;
 }
 
+bool picture_is_png(const char *path)
+{
+    return ends_with(path, ".png");
+}
+
 bool picture_options_ok(picture_options *o)
 {
-    if (o->picture && !ends_with(o->picture, ".png")) {
+    if (o->picture && !picture_is_png(o->picture)) {
         complain("--picture: a name that ends with .png is wanted, not '%s'", o->picture);
         return false;
     }

@@ -66,6 +66,8 @@ typedef struct picture_options {
          NULL},                                                                                                        \
         LOOK_OPTIONS(p)
 
+/* Whether a name ends with .png. */
+bool picture_is_png(const char *path);
 /* Completes what was parsed. False: told on stderr, for wrong usage. */
 bool picture_options_ok(picture_options *options);
 
