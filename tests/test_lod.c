@@ -347,8 +347,9 @@ static void flightsEqualFreshStarts(void **state)
     uint64_t again = 0, nothing = 0;
     for (int kind = 0; kind < VOID_KINDS; kind++) {
         world w = make_world(66, 51, 3, kind, 10, 7);
-        const tl_lod_options options[] = {{.selector = TL_SELECTOR_ROAM, .pixel_error = 6},
-                                          {.selector = TL_SELECTOR_ROAM, .pixel_error = 20, .keep = TL_CULL_FRUSTUM}};
+        const tl_lod_options options[] = {
+            {.selector = TL_SELECTOR_ROAM, .pixel_error = 6},
+            {.selector = TL_SELECTOR_ROAM, .pixel_error = 3, .max_level_given = true, .max_level = 1}};
         for (size_t k = 0; k < sizeof options / sizeof *options; k++)
             fly(&w, &options[k], &seed, &again, &nothing);
         free_world(&w);
@@ -400,6 +401,82 @@ static void budgetsBelowTheCoarsestAreRefused(void **state)
     free_world(&w);
 }
 
+/* ---- Culling ---- */
+
+static bool has_triangle(const corners *all, size_t count, const corners *one)
+{
+    return bsearch(one, all, count, sizeof *all, by_corners) != NULL;
+}
+
+/* Whether a place is on the screen. */
+static bool on_screen(const scene_view *view, uint64_t place, int levels, const tl_mesh *m)
+{
+    const scene_camera *c = scene_view_camera(view);
+    int32_t x = (int32_t)(place >> 32), y = (int32_t)place;
+    double i = ldexp(x, -levels), j = ldexp(y, -levels), at[1][3], out[3];
+    for (size_t k = 0; k < m->vertex_count; k++)
+        if (m->vertices[k].i == x && m->vertices[k].j == y) {
+            scene_view_place(view, 1, &i, &j, &m->vertices[k].z, at);
+            break;
+        }
+    scene_camera_view(c, at[0], out);
+    return out[2] > 0 && fabs(out[0]) < .5 * c->width * out[2] && fabs(out[1]) < .5 * c->height * out[2];
+}
+
+/* Every triangle that is drawn with all rules is drawn, as it is, without them; and what is drawn more without that of
+ * the frustum has no corner on the screen. */
+static void cullingChangesNothingSeen(void **state)
+{
+    (void)state;
+    uint32_t seed = 41;
+    size_t drawn = 0, more = 0;
+    tl_error error;
+    for (int round = 0; round < 24; round++) {
+        world w = make_world(30 + (int)(next_random(&seed) % 40), 30 + (int)(next_random(&seed) % 40), round % 3,
+                             round % 4 == 3 ? VOIDS_FEW : VOIDS_NONE, 10, seed);
+        tl_view view = random_view(&w, &seed);
+        view.fov = 60;
+        scene_view *from = scene_view_create(&view, w.dem, &error);
+        tl_lod_options all = {.selector = (tl_selector)(round % 2), .pixel_error = exp(uniform(&seed, 1, 5))},
+                       kept = all;
+        kept.keep = round % 3 ? TL_CULL_FRUSTUM : 15;
+        tl_mesh *a = select_view(&w, &view, &all, NULL), *b = select_view(&w, &view, &kept, NULL);
+        corners *one = corners_of(a), *two = corners_of(b);
+        for (size_t t = 0; t < a->triangle_count; t++)
+            assert_true(has_triangle(two, b->triangle_count, &one[t]));
+        for (size_t t = 0; t < b->triangle_count && kept.keep == TL_CULL_FRUSTUM; t += 1 + b->triangle_count / 300)
+            if (!has_triangle(one, a->triangle_count, &two[t]))
+                for (int k = 0; k < 3; k++, more++)
+                    assert_false(on_screen(from, two[t].at[k], w.levels, b));
+        expect_no_cracks(b);
+        drawn += a->triangle_count;
+        free(one);
+        free(two);
+        tl_mesh_destroy(a);
+        tl_mesh_destroy(b);
+        scene_view_destroy(from);
+        free_world(&w);
+    }
+    assert_true(drawn > 10000 && more > 1000);
+}
+
+/* A sixth of all directions is on a screen of 60 degrees, and what is under the eye is not. */
+static void culledGroundIsNotMadeNorRead(void **state)
+{
+    (void)state;
+    world w = make_world(1025, 1025, 3, VOIDS_NONE, 10, 3);
+    tl_view view = view_over(&w, 30, -5, 200);
+    view.fov = 60;
+    tl_lod_options all = {.pixel_error = 3}, kept = {.pixel_error = 3, .keep = 15};
+    tl_lod_stats a, b;
+    tl_mesh_destroy(select_view(&w, &view, &all, &a));
+    tl_mesh_destroy(select_view(&w, &view, &kept, &b));
+    assert_true(a.samples_made > 0 && 4 * a.samples_made <= b.samples_made);
+    assert_true(4 * a.tiles_made <= b.tiles_made && 4 * a.dem_samples <= b.dem_samples);
+    assert_true(a.culled[0] > 0 && a.culled[3] > 0);
+    free_world(&w);
+}
+
 /* ---- Depth ---- */
 
 static void finerPixelErrorsContainCoarserOnes(void **state)
@@ -437,9 +514,7 @@ static void maxLevelIsNotPassed(void **state)
                 .selector = (tl_selector)selector, .pixel_error = 1e-6, .max_level_given = true, .max_level = level};
             tl_lod_stats stats;
             tl_mesh *mesh = select_view(&w, &view, &options, &stats);
-            int step = 16 >> level;
-            if (level < 0)
-                step = 16 << -level;
+            int step = level < 0 ? 16 << -level : 16 >> level;
             for (size_t k = 0; k < mesh->vertex_count; k++)
                 assert_true(mesh->vertices[k].i % step == 0 && mesh->vertices[k].j % step == 0);
             assert_true(mesh->triangle_count > 0 && stats.finest_level <= level);
@@ -667,6 +742,8 @@ int main(void)
         cmocka_unit_test(flightsKeepBudgets),
         cmocka_unit_test(budgetsAreKept),
         cmocka_unit_test(budgetsBelowTheCoarsestAreRefused),
+        cmocka_unit_test(cullingChangesNothingSeen),
+        cmocka_unit_test(culledGroundIsNotMadeNorRead),
         cmocka_unit_test(finerPixelErrorsContainCoarserOnes),
         cmocka_unit_test(maxLevelIsNotPassed),
         cmocka_unit_test(bandsSetTheCells),

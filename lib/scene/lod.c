@@ -102,7 +102,7 @@ tl_status lod_init(lod *l, const tl_source *field, const tl_source *dem, const t
     l->unit = g->height_unit;
     l->metres_x = g->cell_x, l->metres_y = g->cell_y;
     l->degrees = g->crs && tl_crs_is_geographic(g->crs) ? fabs(g->transform[1]) + fabs(g->transform[2]) : 0;
-    l->rules = (TL_CULL_FRUSTUM | TL_CULL_BACK | TL_CULL_HORIZON | TL_CULL_RIDGE) & ~options->keep;
+    l->rules = TL_CULL_FRUSTUM | TL_CULL_BACK | TL_CULL_HORIZON | TL_CULL_RIDGE;
     bool alone = !(options->budget || options->band_count);
     l->pixel_error = options->pixel_error > 0 ? options->pixel_error : alone ? 1 : 0;
     l->empty = !find_range(l);
@@ -149,7 +149,7 @@ tl_status lod_look(lod *l, const scene_view *view, tl_error *error)
 {
     lod_turn(l, view);
     tl_status status = l->vertices.count ? lod_place(l, 0, error) : lod_mark_corners(l, error);
-    if (status == TL_OK && l->rules & TL_CULL_RIDGE)
+    if (status == TL_OK)
         status = lod_ridges_create(l, &l->ridges, error);
     return status;
 }

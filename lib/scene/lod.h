@@ -226,7 +226,7 @@ tl_status lod_chunk(lod *l, uint64_t limit, lod_list *leaves, tl_error *error);
 tl_status lod_roam_once(const tl_source *field, const tl_source *dem, const tl_pyramid *pyramid, const tl_view *view,
                         const tl_lod_options *options, tl_mesh **out, tl_lod_stats *stats, tl_error *error);
 /* Whether the square of 2^log steps of the finest lattice at (x, y) is a chunk that is not divided: the log2 of its
- * step, and the rule that hides it, or 0. */
+ * step. *hidden becomes the rule that hides it, divided or not, or 0. */
 bool lod_chunk_says(const struct lod_chunks *chunks, int32_t x, int32_t y, int log, int *step_log, unsigned *hidden);
 
 /* For selectors: adds a leaf, and asks for what its drawing needs. */

@@ -64,9 +64,9 @@ static tl_status put(struct lod_chunks *c, chunk item, tl_error *error)
 bool lod_chunk_says(const struct lod_chunks *c, int32_t x, int32_t y, int log, int *step_log, unsigned *hidden)
 {
     const chunk *found = c->room ? find(c, key_of(x, y, log)) : NULL;
-    if (!found || !found->key || found->state == CHUNK_DIVIDED)
+    *hidden = found && found->key ? found->rule : 0;
+    if (!found || found->state != CHUNK_DRAWN)
         return false;
-    *hidden = found->rule;
     *step_log = log > STEPS_LOG ? log - STEPS_LOG : 0;
     return true;
 }
@@ -130,7 +130,7 @@ static tl_status look_at(lod *l, const square *s, chunk *out, tl_error *error)
     int log = s->log - l->levels;
     if (!out->rule && l->ridges && log >= 0 && lod_ridges_hide(l->ridges, s->x / l->cell, s->y / l->cell, log))
         out->rule = TL_CULL_RIDGE;
-    if (!out->rule && log <= SCENE_TILE_LOG) {
+    if (!(out->rule & ~l->options->keep) && log <= SCENE_TILE_LOG) {
         tl_status status = scene_tiles_want_block(l->tiles, s->x / l->cell, s->y / l->cell, &block, error);
         if (status == TL_OK)
             status = scene_tiles_make(l->tiles, l->run, error);
@@ -138,9 +138,10 @@ static tl_status look_at(lod *l, const square *s, chunk *out, tl_error *error)
             return status;
         extent = extent_of(l, s, block);
         scene_view_box(l->view, &extent, &box);
-        out->rule = (unsigned char)scene_view_hides(l->view, &extent, &box, HUGE_VAL, l->rules & TL_CULL_FRUSTUM);
+        if (!out->rule)
+            out->rule = (unsigned char)scene_view_hides(l->view, &extent, &box, HUGE_VAL, l->rules & TL_CULL_FRUSTUM);
     }
-    if (out->rule)
+    if (out->rule & ~l->options->keep)
         out->state = CHUNK_HIDDEN;
     else if (s->log > STEPS_LOG && lod_wants(l, 2 * (l->lattice_log - s->log + STEPS_LOG), error_of(l, s, block),
                                              scene_view_distance(l->view, &box)))

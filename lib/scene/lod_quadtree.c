@@ -1,5 +1,6 @@
 /* Breadth first, with two queues: all triangles of one size are looked at together, so that what they need is made
  * together, and then those that they are split into. */
+#include "dem/framework.h"
 #include "lib/base/error.h"
 #include "lib/base/size.h"
 #include "lib/scene/lod.h"
@@ -8,11 +9,18 @@
 
 enum { TESTED = 512 };
 
+/* What is hidden by a rule that is switched off is searched for in a second pass, with the rules that are left. It may
+ * not split what is seen: so switching rules off changes nothing that is seen, to the last triangle. */
 typedef struct search {
     lod *l;
     lod_list current, next; /* lod_triangle */
     lod_list verdicts;      /* lod_verdict, of the current ones */
     lod_list *leaves;
+    lod_list hidden;  /* lod_leaf: by rules that are switched off; by depth */
+    size_t taken;     /* of these, in the second pass */
+    uint64_t *seen;   /* keys of the middles of leaves that are not split, by open addressing; NULL in the first pass */
+    size_t seen_room; /* a power of two */
+    unsigned rules;
     int depth;
 } search;
 
@@ -26,7 +34,7 @@ static tl_status test_item(void *context, tl_parallel *loop, uint64_t item, unsi
     end = end < self->current.count ? end : self->current.count;
     const lod_triangle *triangles = self->current.items;
     for (size_t k = (size_t)item * TESTED; k < end; k++)
-        ((lod_verdict *)self->verdicts.items)[k] = lod_test(self->l, &triangles[k], self->depth, self->l->rules);
+        ((lod_verdict *)self->verdicts.items)[k] = lod_test(self->l, &triangles[k], self->depth, self->rules);
     return TL_OK;
 }
 
@@ -74,6 +82,82 @@ tl_status lod_leave(lod *l, const lod_triangle *t, int depth, lod_list *leaves, 
     return lod_opposite(l, t, &x, &y) ? lod_ask(l, x, y, error) : TL_OK;
 }
 
+/* ---- The second pass ---- */
+
+static uint64_t vertex_key(int32_t x, int32_t y)
+{
+    return ((uint64_t)(uint32_t)x << 32 | (uint32_t)y) + 1;
+}
+
+static size_t seen_slot(const search *self, uint64_t key)
+{
+    size_t at = (size_t)((key * UINT64_C(0x9e3779b97f4a7c15)) >> 20) & (self->seen_room - 1);
+    while (self->seen[at] && self->seen[at] != key)
+        at = (at + 1) & (self->seen_room - 1);
+    return at;
+}
+
+/* Notes the middles of all leaves that are not split for another. */
+static tl_status note_seen(search *self, tl_error *error)
+{
+    const scene_tile *last = NULL;
+    const lod_leaf *leaves = self->leaves->items;
+    for (self->seen_room = 1024; self->seen_room < 2 * self->leaves->count;)
+        self->seen_room *= 2;
+    self->seen = calloc(self->seen_room, sizeof *self->seen);
+    if (!self->seen)
+        return tl_fail_memory(error, "the view's triangles");
+    for (size_t k = 0; k < self->leaves->count; k++) {
+        int32_t x, y;
+        lod_middle(self->l, &leaves[k].triangle, &x, &y);
+        if (leaves[k].depth < 2 * self->l->lattice_log &&
+            lod_splitter(self->l, &leaves[k].triangle, leaves[k].depth, &last) == LOD_NONE)
+            self->seen[seen_slot(self, vertex_key(x, y))] = vertex_key(x, y);
+    }
+    return TL_OK;
+}
+
+/* Whether marking a vertex, and all that it needs, splits no leaf of the first pass. */
+static bool is_free(const search *self, int32_t x, int32_t y, const scene_tile **last)
+{
+    const lod *l = self->l;
+    scene_slot slot = scene_tiles_find(l->tiles, x, y, last);
+    if (slot.tile && scene_slot_marked(slot))
+        return true;
+    if (self->seen[seen_slot(self, vertex_key(x, y))])
+        return false;
+    int64_t up[2][2];
+    tl_lattice_parents(x, y, up);
+    for (int k = 0; k < 2; k++)
+        if (up[k][0] >= 0 && up[k][1] >= 0 && up[k][0] <= l->right && up[k][1] <= l->bottom &&
+            !is_free(self, (int32_t)up[k][0], (int32_t)up[k][1], last))
+            return false;
+    return true;
+}
+
+static bool may_split(const search *self, const lod_triangle *t)
+{
+    const scene_tile *last = NULL;
+    int32_t x, y;
+    lod_middle(self->l, t, &x, &y);
+    return !self->seen || is_free(self, x, y, &last);
+}
+
+/* ---- One depth ---- */
+
+/* Leaves out a hidden triangle, or lays it aside for the second pass. */
+static tl_status leave_out(search *self, const lod_triangle *t, unsigned rule, tl_error *error)
+{
+    if (!(rule & self->l->options->keep)) {
+        self->l->stats.culled[rule_index(rule)]++;
+        return TL_OK;
+    }
+    if (!lod_list_grow(&self->hidden, 1, sizeof(lod_leaf)))
+        return tl_fail_memory(error, "the view's triangles");
+    ((lod_leaf *)self->hidden.items)[self->hidden.count++] = (lod_leaf){*t, self->depth};
+    return TL_OK;
+}
+
 /* Sorts the tested triangles into leaves, and those whose middles are asked for, which stay in `current`. */
 static tl_status sort_out(search *self, tl_error *error)
 {
@@ -85,14 +169,15 @@ static tl_status sort_out(search *self, tl_error *error)
     l->asked.count = 0;
     for (size_t k = 0; k < self->current.count && status == TL_OK; k++) {
         const lod_verdict *v = (const lod_verdict *)self->verdicts.items + k;
+        bool split = v->state == LOD_SPLIT && may_split(self, &triangles[k]);
         if (v->state == LOD_HIDDEN)
-            l->stats.culled[rule_index(v->rule)]++;
-        else if (v->state == LOD_LEAF) {
-            l->stats.pixel_error = fmax(l->stats.pixel_error, (double)v->pixels);
-            status = lod_leave(l, &triangles[k], self->depth, self->leaves, error);
-        } else if (v->state == LOD_SPLIT) {
+            status = leave_out(self, &triangles[k], v->rule, error);
+        else if (split) {
             triangles[kept] = triangles[k];
             triangles[kept++].step = v->step;
+        } else if (v->state != LOD_DROPPED) {
+            l->stats.pixel_error = fmax(l->stats.pixel_error, self->seen ? 0 : (double)v->pixels);
+            status = lod_leave(l, &triangles[k], self->depth, self->leaves, error);
         }
     }
     self->current.count = kept;
@@ -142,7 +227,7 @@ static tl_status enter_blocks(search *self, tl_error *error)
     for (size_t k = 0; k < self->current.count && status == TL_OK; k++) {
         const lod_verdict *v = (const lod_verdict *)self->verdicts.items + k;
         if (v->state == LOD_HIDDEN)
-            l->stats.culled[rule_index(v->rule)]++;
+            status = leave_out(self, &triangles[k], v->rule, error);
         else if (v->state != LOD_DROPPED)
             triangles[kept++] = triangles[k];
     }
@@ -167,26 +252,62 @@ static tl_status one_depth(search *self, tl_error *error)
     return status;
 }
 
+/* Takes the laid aside triangles of this depth in. */
+static tl_status take_hidden(search *self, tl_error *error)
+{
+    const lod_leaf *hidden = self->hidden.items;
+    while (self->taken < self->hidden.count && hidden[self->taken].depth == self->depth) {
+        if (!lod_list_grow(&self->current, 1, sizeof(lod_triangle)))
+            return tl_fail_memory(error, "the view's triangles");
+        ((lod_triangle *)self->current.items)[self->current.count++] = hidden[self->taken++].triangle;
+    }
+    return TL_OK;
+}
+
+/* Searches from the queue on, and from what is laid aside. */
+static tl_status search_all(search *self, uint64_t limit, tl_error *error)
+{
+    lod *l = self->l;
+    tl_status status = TL_OK;
+    for (self->depth = 0; status == TL_OK && !l->overflow && self->depth <= 2 * l->lattice_log; self->depth++) {
+        if (self->seen)
+            status = take_hidden(self, error);
+        if (status != TL_OK || !self->current.count)
+            continue;
+        status = one_depth(self, error);
+        lod_list done = self->current;
+        self->current = self->next;
+        self->next = done;
+        self->next.count = 0;
+        l->overflow = limit && l->certain > limit;
+    }
+    return status == TL_OK && !l->overflow ? lod_close(l, error) : status;
+}
+
+static tl_status search_hidden(search *self, uint64_t limit, tl_error *error)
+{
+    tl_status status = note_seen(self, error);
+    self->rules &= ~self->l->options->keep;
+    self->current.count = 0;
+    return status == TL_OK ? search_all(self, limit, error) : status;
+}
+
 tl_status lod_quadtree(lod *l, uint64_t limit, lod_list *leaves, tl_error *error)
 {
-    search self = {.l = l, .leaves = leaves};
+    search self = {.l = l, .leaves = leaves, .rules = l->rules};
     tl_status status =
         lod_list_grow(&self.current, 2, sizeof(lod_triangle)) ? TL_OK : tl_fail_memory(error, "the view");
     if (status == TL_OK) {
         lod_roots(l, self.current.items);
         self.current.count = 2;
+        status = search_all(&self, limit, error);
     }
-    for (; status == TL_OK && self.current.count; self.depth++) {
-        status = one_depth(&self, error);
-        lod_list done = self.current;
-        self.current = self.next;
-        self.next = done;
-        l->overflow = limit && l->certain > limit;
-        if (l->overflow)
-            break;
-    }
+    if (status == TL_OK && !l->overflow && self.hidden.count)
+        status = search_hidden(&self, limit, error);
     free(self.current.items);
     free(self.next.items);
     free(self.verdicts.items);
-    return status == TL_OK && !l->overflow ? lod_close(l, error) : status;
+    free(self.hidden.items);
+    free(self.seen);
+    return status;
 }

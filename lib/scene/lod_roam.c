@@ -703,12 +703,32 @@ static void fill_stats(const tl_roam *r, tl_lod_stats *out)
     out->vertices = r->l.vertices.count - r->free_vertices.count;
 }
 
+/* Where rules are switched off, what they hide depends on all that is seen: it is searched for from nothing. */
+static tl_status select_kept(const tl_roam *r, const tl_view *view, tl_mesh **out, tl_lod_stats *stats, tl_error *error)
+{
+    tl_lod_options options = r->options;
+    options.selector = TL_SELECTOR_QUADTREE;
+    return tl_select(r->l.field, r->l.dem, r->l.pyramid, view, &options, out, stats, error);
+}
+
+static tl_status look_kept(tl_roam *r, const tl_view *view, tl_lod_stats *stats, tl_error *error)
+{
+    tl_mesh *mesh = NULL;
+    tl_status status = select_kept(r, view, &mesh, stats, error);
+    tl_mesh_destroy(mesh);
+    r->view = *view;
+    r->seen_any = true;
+    return status;
+}
+
 tl_status tl_roam_look(tl_roam *r, const tl_view *view, tl_lod_stats *stats, tl_error *error)
 {
     double start = lod_now();
     lod *l = &r->l;
     if (r->failed)
         return tl_fail(error, TL_ERROR_ARGUMENT, "%s: a view before failed; start again", l->dem->info.name);
+    if (r->options.keep)
+        return look_kept(r, view, stats, error);
     scene_view *from = scene_view_create(view, l->dem, error);
     if (!from)
         return TL_ERROR_ARGUMENT;
@@ -717,8 +737,7 @@ tl_status tl_roam_look(tl_roam *r, const tl_view *view, tl_lod_stats *stats, tl_
     tl_status status = TL_OK;
     if (!l->empty) {
         lod_turn(l, from);
-        if (l->rules & TL_CULL_RIDGE)
-            status = lod_ridges_create(l, &l->ridges, error);
+        status = lod_ridges_create(l, &l->ridges, error);
         if (status == TL_OK)
             status = update(r, error);
     }
@@ -745,6 +764,8 @@ tl_status tl_roam_mesh(tl_roam *r, tl_mesh **out, tl_error *error)
     lod *l = &r->l;
     if (!r->seen_any || r->failed)
         return tl_fail(error, TL_ERROR_ARGUMENT, "%s: there is no view yet; give one", l->dem->info.name);
+    if (r->options.keep)
+        return select_kept(r, &r->view, out, NULL, error);
     tl_status status = TL_OK;
     if (!l->empty)
         status = gather_all(r, error);

@@ -386,14 +386,14 @@ void lod_allow(lod *l, double pixel_error)
 }
 
 /* Whether a triangle wants to be split for its chunk; finds that, and whether it is hidden. */
-static bool wants_for_chunk(const lod *l, const subject *s, const lod_triangle *t, lod_verdict *out)
+static bool wants_for_chunk(const lod *l, const subject *s, const lod_triangle *t, unsigned rules, lod_verdict *out)
 {
     int stage = stage_of(l, s->depth), step = t->step - 1;
     unsigned hidden = 0;
-    if (!t->step && !(s->depth & 1) && lod_chunk_says(l->chunks, s->at.x0, s->at.y0, stage + 1, &step, &hidden)) {
-        if (hidden)
-            *out = (lod_verdict){.state = LOD_HIDDEN, .rule = (unsigned char)hidden};
-    }
+    if (!t->step && !(s->depth & 1))
+        lod_chunk_says(l->chunks, s->at.x0, s->at.y0, stage + 1, &step, &hidden);
+    if (hidden & rules)
+        *out = (lod_verdict){.state = LOD_HIDDEN, .rule = (unsigned char)hidden};
     out->step = (signed char)(step + 1);
     return (step < 0 || stage >= step) && level_of(l, s->depth) <= l->finest;
 }
@@ -430,7 +430,7 @@ lod_verdict lod_test(const lod *l, const lod_triangle *t, int depth, unsigned ru
     if (can && !forced && level <= l->finest)
         out.margin = l->options->band_count ? -1 : (float)fmin(seen.margin, fabs(seen.distance - l->near * error));
     if (l->chunks) {
-        bool wants = wants_for_chunk(l, &s, t, &out);
+        bool wants = wants_for_chunk(l, &s, t, rules, &out);
         if (can && !forced)
             out.priority = wants ? HUGE_VALF : -1;
     }
