@@ -464,10 +464,10 @@ static void cullingChangesNothingSeen(void **state)
 static void culledGroundIsNotMadeNorRead(void **state)
 {
     (void)state;
-    world w = make_world(1025, 1025, 3, VOIDS_NONE, 10, 3);
+    world w = make_world(2049, 2049, 3, VOIDS_NONE, 10, 3);
     tl_view view = view_over(&w, 30, -5, 200);
     view.fov = 60;
-    tl_lod_options all = {.pixel_error = 3}, kept = {.pixel_error = 3, .keep = 15};
+    tl_lod_options all = {.pixel_error = 6}, kept = {.pixel_error = 6, .keep = 15};
     tl_lod_stats a, b;
     tl_mesh_destroy(select_view(&w, &view, &all, &a));
     tl_mesh_destroy(select_view(&w, &view, &kept, &b));
