@@ -14,12 +14,17 @@ static const char *const mips[] = {[TL_MIP_NONE] = "none", [TL_MIP_LATTICE] = "l
 static const char *const supports[] = {
     [TL_SUPPORT_RASTER] = "raster", [TL_SUPPORT_AREA] = "area", [TL_SUPPORT_POINT] = "point", NULL};
 
+enum { LAYERS_AS_EXR, LAYERS_AS_PNG };
+static const char *const layer_formats[] = {[LAYERS_AS_EXR] = "exr", [LAYERS_AS_PNG] = "png", NULL};
+
 typedef struct settings {
     common common;
     tl_field_options field;
     tl_noise_options noise;
     int64_t levels, seed;
     int compression, mip, frame, support;
+    const char *layers, *layer_rules;
+    int layer_format;
     const char *preset;
     int64_t tile;
     double quantum; /* step of the heights */
@@ -93,6 +98,51 @@ static void warn_of_loss(const settings *set)
             "Brownian motion");
 }
 
+/* "terrain.exr" and "normal" to "terrain.normal.exr"; free it. */
+static char *layer_path(const settings *set, const char *kind)
+{
+    const char *output = set->common.output, *ending = layer_formats[set->layer_format];
+    size_t stem = (size_t)(strrchr(output, '.') - output), room = stem + strlen(kind) + strlen(ending) + 3;
+    char *path = malloc(room);
+    if (path)
+        snprintf(path, room, "%.*s.%s.%s", (int)stem, output, kind, ending);
+    return path;
+}
+
+static tl_status write_layer(const settings *set, const tl_source *made, const char *kind, const tl_run *run,
+                             tl_error *error)
+{
+    const tl_layer_options options = {.rules = set->layer_rules,
+                                      .overwrite = set->common.overwrite,
+                                      .compression = (tl_compression)set->compression,
+                                      .run = run};
+    char *path = layer_path(set, kind);
+    if (!path) {
+        *error = (tl_error){TL_ERROR_MEMORY, "not enough memory for a name"};
+        return TL_ERROR_MEMORY;
+    }
+    tl_status status = tl_write_layer(made, kind, path, &options, error);
+    if (status == TL_OK)
+        command_say(&set->common, "%s", path);
+    free(path);
+    return status;
+}
+
+static tl_status write_layers(const settings *set, const tl_source *made, const tl_run *run, progress *bar,
+                              tl_error *error)
+{
+    char *list = set->layers ? strdup(set->layers) : NULL, *rest;
+    tl_status status = TL_OK;
+    for (char *kind = list ? strtok_r(list, ",", &rest) : NULL; kind && status == TL_OK;
+         kind = strtok_r(NULL, ",", &rest)) {
+        progress_stage(bar, kind);
+        status = write_layer(set, made, kind, run, error);
+        progress_end(bar);
+    }
+    free(list);
+    return status;
+}
+
 static int write_out(const settings *set, const tl_source *made, const tl_run *run, progress *bar)
 {
     tl_error error;
@@ -100,13 +150,39 @@ static int write_out(const settings *set, const tl_source *made, const tl_run *r
     if (write_grid(set, made, run, &error) != TL_OK)
         return command_failed(bar, &error);
     report(set, made, progress_end(bar));
+    if (write_layers(set, made, run, bar, &error) != TL_OK)
+        return command_failed(bar, &error);
     warn_of_loss(set);
     return EXIT_DONE;
 }
 
 /* Whether the output's format holds what is asked for. */
+static bool layers_ok(const settings *set)
+{
+    char *list = set->layers ? strdup(set->layers) : NULL, *rest;
+    bool good = !(set->layers && set->preset);
+    if (!good)
+        complain("--layers and --preset exclude each other");
+    for (char *name = list ? strtok_r(list, ",", &rest) : NULL; name && good; name = strtok_r(NULL, ",", &rest)) {
+        const tl_layer_kind *kind = tl_layers();
+        while (kind->name && strcmp(kind->name, name) != 0)
+            kind++;
+        good = kind->name;
+        if (!good) {
+            size_t count = 0;
+            while (tl_layers()[count].name)
+                count++;
+            complain_of_choice("layers", name, &tl_layers()->name, count, sizeof *kind);
+        }
+    }
+    free(list);
+    return good;
+}
+
 static bool mip_ok(const settings *set)
 {
+    if (!layers_ok(set))
+        return false;
     if (set->tile && !set->preset) {
         complain("--tile is for --preset; give that too, or leave it away");
         return false;
@@ -391,6 +467,14 @@ static int run_synth(const command *self, int argc, const char **argv, bool help
                               0, 0, NULL},
                              {"tile", 0, OPTION_INTEGER, &set.tile, NULL, "N",
                               "samples on a side of the tiles of a preset (default: chosen)", 1, 65536, NULL},
+                             {"layers", 0, OPTION_TEXT, &set.layers, NULL, "KINDS",
+                              "write these beside the heights, with commas between: normal, tangent, slope, curvature, "
+                              "splat, colour, sigma",
+                              0, 0, NULL},
+                             {"layer-format", 0, OPTION_CHOICE, &set.layer_format, NULL, "FORMAT",
+                              "of the layers (default: exr)", 0, 0, layer_formats},
+                             {"layer-rules", 0, OPTION_TEXT, &set.layer_rules, NULL, "FILE",
+                              "a JSON file that says where splat has rock, scree, soil and snow", 0, 0, NULL},
                              {"mip", 0, OPTION_CHOICE, &set.mip, NULL, "KIND",
                               "coarser levels in an .exr, of every second sample or of means (default: none)", 0, 0,
                               mips},

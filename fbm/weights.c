@@ -8,8 +8,8 @@
 
 /* The tuned table, reference data of the project (weights24.csv): for each H the coefficients of the 24-point
  * predictor and of the 3 x 3 residual filter that bring the exactly propagated structure function of repeated
- * refinement closest to fBm's at all positions and lags. fbm/tune.h derives such rows again: `ninja weights-table` prints
- * them, and how good both are; doc/accuracy.md has the comparison. */
+ * refinement closest to fBm's at all positions and lags. fbm/tune.h derives such rows again: `ninja weights-table`
+ * prints them, and how good both are; doc/accuracy.md has the comparison. */
 enum { KNOTS = 25, COLUMNS = 7 };
 
 static const double table[KNOTS][1 + COLUMNS] = {

@@ -1044,6 +1044,40 @@ TL_API bool tl_framework_is_file(const char *path);
 /* Reads the framework back: the same points, triangles and bound. TL_ERROR_ARGUMENT where it is none. */
 TL_API tl_framework *tl_framework_load(const char *path, const tl_run *run, tl_error *error);
 
+/* ---- Layers -------------------------------------------------------------------------------------- */
+
+/* What can be told of every sample beside its height. */
+typedef struct tl_layer_kind {
+    const char *name;    /* "normal" */
+    const char *summary; /* one line */
+    size_t channels;     /* values a sample, 1 ... 4 */
+    const char *channel_names[4];
+} tl_layer_kind;
+
+/* The kinds, ended by an entry whose name is NULL. Slopes are those of central differences in metres, for geographic
+ * rasters by the ellipsoid at the row's latitude; windows made apart join. */
+TL_API const tl_layer_kind *tl_layers(void);
+
+typedef struct tl_layer_options {
+    /* Of splat: a JSON file of rules, or NULL for built-in ones (temperate mountains). For each of rock, scree, soil
+     * and snow an object of ramps over slope (degrees), height (metres), curvature (1/m) and sigma (metres), [0 at, 1
+     * from] or [0 at, 1 from, 1 to, 0 at], rising, with null for no bound, and a weight (1). Shares are weights times
+     * ramps, scaled to add up to 1. */
+    const char *rules;
+    bool overwrite;
+    tl_compression compression; /* of EXR and GeoTIFF */
+    const tl_run *run;
+} tl_layer_options;
+
+/* One channel of a layer as a source: NaN where the height is void. TL_ERROR_ARGUMENT for kinds that are not there, and
+ * for sigma over heights that tl_field_create did not make. */
+TL_API tl_source *tl_layer_create(const tl_source *heights, const char *kind, size_t channel,
+                                  const tl_layer_options *options, tl_error *error);
+/* Writes a layer: .exr with its channels; .png with 8 bits (normals from -1 ... 1, slopes from 0 ... 90 degrees,
+ * shares, sRGB; not curvature and sigma); .tif where it has one channel. Pictures have the north in their first row. */
+TL_API tl_status tl_write_layer(const tl_source *heights, const char *kind, const char *path,
+                                const tl_layer_options *options, tl_error *error);
+
 /* ---- Game engines and modellers ------------------------------------------------------------------- */
 
 /* What a program imports best. */

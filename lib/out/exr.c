@@ -110,7 +110,10 @@ static exr_result_t set_parameters(exr_context_t file, const tl_source_info *inf
     return code;
 }
 
-static exr_result_t set_header(exr_context_t file, const tl_source_info *info, const tl_write_options *options)
+static const char *const heights_name[] = {"Y"};
+
+static exr_result_t set_header(exr_context_t file, const tl_source_info *info, const out_planes *planes,
+                               const tl_write_options *options)
 {
     exr_attr_box2i_t window;
     exr_attr_v2f_t centre;
@@ -119,7 +122,7 @@ static exr_result_t set_header(exr_context_t file, const tl_source_info *info, c
     window.max.y = (int32_t)info->height - 1;
     centre.x = centre.y = 0;
     int part;
-    exr_result_t code = exr_add_part(file, "heights", EXR_STORAGE_TILED, &part);
+    exr_result_t code = exr_add_part(file, planes->read ? "layer" : "heights", EXR_STORAGE_TILED, &part);
     if (code ==
         EXR_ERR_SUCCESS) /* random order, for the file is complete when it gets its name; ours is always the same */
         code = exr_initialize_required_attr(file, PART, &window, &window, 1.0f, &centre, 1.0f, EXR_LINEORDER_RANDOM_Y,
@@ -128,8 +131,8 @@ static exr_result_t set_header(exr_context_t file, const tl_source_info *info, c
         code = exr_set_tile_descriptor(file, PART, OUT_TILE, OUT_TILE,
                                        options->mip ? EXR_TILE_MIPMAP_LEVELS : EXR_TILE_ONE_LEVEL,
                                        options->mip ? EXR_TILE_ROUND_UP : EXR_TILE_ROUND_DOWN);
-    if (code == EXR_ERR_SUCCESS)
-        code = exr_add_channel(file, PART, "Y", EXR_PIXEL_FLOAT, EXR_PERCEPTUALLY_LINEAR, 1, 1);
+    for (size_t k = 0; code == EXR_ERR_SUCCESS && k < planes->count; k++)
+        code = exr_add_channel(file, PART, planes->names[k], EXR_PIXEL_FLOAT, EXR_PERCEPTUALLY_LINEAR, 1, 1);
     if (code == EXR_ERR_SUCCESS)
         code = set_georeference(file, info);
     if (code == EXR_ERR_SUCCESS)
@@ -151,6 +154,7 @@ typedef struct worker {
 
 typedef struct writing {
     const tl_source *source;
+    const out_planes *planes;
     exr_context_t file;
     out_tiling tiling; /* of the level in hand */
     int level;         /* halvings of the source's finest */
@@ -167,6 +171,23 @@ static exr_result_t await_turn(exr_encode_pipeline_t *pipeline)
     return self->gave_up ? EXR_ERR_INCORRECT_CHUNK : EXR_ERR_SUCCESS;
 }
 
+/* The file keeps channels by their names' order. */
+static void set_channels(const writing *w, worker *self, tl_window window)
+{
+    size_t samples = (size_t)(window.width * window.height);
+    for (int c = 0; c < self->pipeline.channel_count; c++) {
+        exr_coding_channel_info_t *channel = &self->pipeline.channels[c];
+        size_t k = 0;
+        while (k + 1 < w->planes->count && strcmp(w->planes->names[k], channel->channel_name) != 0)
+            k++;
+        channel->encode_from_ptr = (const uint8_t *)(self->heights + k * samples);
+        channel->user_pixel_stride = sizeof(float);
+        channel->user_line_stride = (int32_t)((size_t)window.width * sizeof(float));
+        channel->user_bytes_per_element = sizeof(float);
+        channel->user_data_type = EXR_PIXEL_FLOAT;
+    }
+}
+
 static exr_result_t encode(const writing *w, worker *self, tl_window window)
 {
     exr_chunk_info_t chunk;
@@ -178,11 +199,7 @@ static exr_result_t encode(const writing *w, worker *self, tl_window window)
                            : exr_encoding_initialize(w->file, PART, &chunk, pipeline);
     if (code != EXR_ERR_SUCCESS)
         return code;
-    pipeline->channels[0].encode_from_ptr = (const uint8_t *)self->heights;
-    pipeline->channels[0].user_pixel_stride = sizeof(float);
-    pipeline->channels[0].user_line_stride = (int32_t)((size_t)window.width * sizeof(float));
-    pipeline->channels[0].user_bytes_per_element = sizeof(float);
-    pipeline->channels[0].user_data_type = EXR_PIXEL_FLOAT;
+    set_channels(w, self, window);
     pipeline->encoding_user_data = self;
     code = self->begun ? EXR_ERR_SUCCESS : exr_encoding_choose_default_routines(w->file, PART, pipeline);
     self->begun = true;
@@ -192,6 +209,8 @@ static exr_result_t encode(const writing *w, worker *self, tl_window window)
 
 static tl_status read_tile(const writing *w, tl_window window, float *out, tl_error *error)
 {
+    if (w->planes->read)
+        return w->planes->read(w->planes->context, window, out, error);
     if (w->level == 0)
         return tl_source_read(w->source, w->source->info.level, window, out, error);
     const struct out_mip_level *level = &w->mip.levels[w->level];
@@ -209,7 +228,8 @@ static tl_status write_tile(void *context, tl_parallel *loop, uint64_t tile, uns
     tl_status status = read_tile(w, window, self->heights, error);
     if (status != TL_OK)
         return status;
-    out_mip_add(&w->mip, w->level, window, self->heights);
+    if (!w->planes->read)
+        out_mip_add(&w->mip, w->level, window, self->heights);
     out_extent_add(&self->extent, self->heights, (size_t)(window.width * window.height));
     self->loop = loop;
     self->tile = tile;
@@ -246,7 +266,7 @@ static tl_status write_tiles(writing *w, const tl_run *run, out_extent *extent, 
         return tl_fail_memory(error, tl_output_path(w->to->output));
     for (unsigned i = 0; i < count; i++) {
         w->workers[i].extent = out_extent_empty();
-        w->workers[i].heights = tl_alloc_grid(OUT_TILE, OUT_TILE, sizeof(float));
+        w->workers[i].heights = tl_alloc_grid(OUT_TILE, OUT_TILE, w->planes->count * sizeof(float));
         if (!w->workers[i].heights)
             status = tl_fail_memory(error, tl_output_path(w->to->output));
     }
@@ -306,7 +326,8 @@ static tl_status check_size(const tl_source_info *info, const char *path, tl_err
                    path, (long long)info->width, (long long)info->height);
 }
 
-tl_status out_exr_write(const tl_source *source, tl_output *output, const tl_write_options *options, tl_error *error)
+static tl_status write_exr(const tl_source *source, const out_planes *planes, tl_output *output,
+                           const tl_write_options *options, tl_error *error)
 {
     const char *path = tl_output_path(output);
     tl_status status = check_size(&source->info, path, error);
@@ -318,7 +339,7 @@ tl_status out_exr_write(const tl_source *source, tl_output *output, const tl_wri
     start.error_handler_fn = on_error;
     start.user_data = &to;
     start.write_fn = on_write;
-    writing w = {.source = source, .tiling = out_tiling_of(source), .to = &to};
+    writing w = {.source = source, .planes = planes, .tiling = out_tiling_of(source), .to = &to};
     status = out_mip_init(&w.mip, options->mip, source->info.width, source->info.height, options->run, path, error);
     if (status != TL_OK)
         return status;
@@ -328,7 +349,7 @@ tl_status out_exr_write(const tl_source *source, tl_output *output, const tl_wri
         return tl_fail(error, TL_ERROR_IO, "%s: OpenEXR cannot write it: %s", path,
                        exr_get_default_error_message(code));
     }
-    code = set_header(w.file, &source->info, options);
+    code = set_header(w.file, &source->info, planes, options);
     out_extent extent = out_extent_empty();
     status = code == EXR_ERR_SUCCESS ? write_tiles(&w, options->run, &extent, error) : exr_failed(code, &to, error);
     out_mip_finish(&w.mip);
@@ -338,4 +359,18 @@ tl_status out_exr_write(const tl_source *source, tl_output *output, const tl_wri
     if (own.status != TL_OK && error)
         *error = own;
     return status == TL_OK ? patch_extent(output, &extent, error) : status;
+}
+
+tl_status out_exr_write(const tl_source *source, tl_output *output, const tl_write_options *options, tl_error *error)
+{
+    const out_planes heights = {.count = 1, .names = heights_name};
+    return write_exr(source, &heights, output, options, error);
+}
+
+tl_status out_exr_write_planes(const tl_source *source, const out_planes *planes, tl_output *output,
+                               const tl_write_options *options, tl_error *error)
+{
+    tl_write_options plain = *options;
+    plain.mip = TL_MIP_NONE;
+    return write_exr(source, planes, output, &plain, error);
 }

@@ -30,6 +30,19 @@ tl_status out_png16_write(const tl_source *source, const char *path, const tl_wr
 tl_status out_r16_write(const tl_source *source, const char *path, const tl_write_options *options, tl_error *error);
 tl_status out_raw_write(const tl_source *source, const char *path, const tl_write_options *options, tl_error *error);
 
+/* Several values a sample. */
+typedef struct out_planes {
+    size_t count;             /* 1 ... OUT_BANDS */
+    const char *const *names; /* of the channels */
+    /* The window's values, channel by channel; any number of threads. */
+    tl_status (*read)(void *context, tl_window window, float *out, tl_error *error);
+    void *context;
+} out_planes;
+
+/* An EXR of these channels over the lattice of `source`, whose heights it does not read. No mipmaps. */
+tl_status out_exr_write_planes(const tl_source *source, const out_planes *planes, tl_output *output,
+                               const tl_write_options *options, tl_error *error);
+
 /* Opens an EXR heightfield that out_exr_write wrote. */
 tl_source *out_exr_open(const char *path, tl_error *error);
 

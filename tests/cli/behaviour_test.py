@@ -776,6 +776,21 @@ def codings_keep_the_bound(case):
     expect("--coding is for .glb" in refused, refused)
 
 
+def layers_are_written_beside(case):
+    """Layers get names of their own, and the size of the heights; unknown ones are refused before the work."""
+    case.run("synth", EXAMPLE, "--window", "0,0,40,30", "-l", 2, "--layers", "normal,splat,slope", "-q", "-o", "t.exr")
+    expect("160 x 120" in case.run("info", "t.slope.exr").out, "size of the slope")
+    for kind in ("normal", "splat", "slope"):
+        expect(os.path.getsize(case.path(f"t.{kind}.exr")) > 5000, kind)
+    case.run("synth", EXAMPLE, "--window", "0,0,40,30", "-l", 2, "--layers", "colour", "--layer-format", "png", "-q", "-o", "u.exr")
+    with open(case.path("u.colour.png"), "rb") as file:
+        head = file.read(24)
+    expect(head[1:4] == b"PNG" and struct.unpack(">II", head[16:24]) == (160, 120), f"{head}")
+    refused = case.run("synth", EXAMPLE, "--layers", "normal,gloss", "-o", "v.exr", status=2).err
+    expect("gloss" in refused and "curvature" in refused, refused)
+    expect(not os.path.exists(case.path("v.exr")), "work was done")
+
+
 # ---- the manuals ----
 
 def commands_in_readme():
@@ -970,7 +985,7 @@ TESTS = [
     names_of_any_bytes,
     formats_hold_the_same_heights, png_within_half_a_step, point_samples_are_kept, point_samples_of_the_andes_are_kept,
     area_means_stay_on_their_footprint,
-    glb_is_in_metres, frames_agree, simplify_keeps_its_word, diagonals_are_turned, codings_keep_the_bound,
+    glb_is_in_metres, frames_agree, simplify_keeps_its_word, diagonals_are_turned, codings_keep_the_bound, layers_are_written_beside,
     manuals_show_what_works, man_page_knows_every_option,
     memory_does_not_grow_with_the_output, memory_stays_within_what_is_given, bad_files_end_with_one_line,
     gdal_reads_the_geotiff, gdal_places_the_example, openexr_reads_the_exr, openimageio_agrees_on_the_range,

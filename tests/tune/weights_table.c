@@ -1,5 +1,5 @@
 /* Prints the table of fbm/weights.c as fbm/tune.h derives it, beside what the table has now: `ninja weights-table` in
- * the build folder. Takes some 20 minutes, or, by `lib/weights_table H ...`, less for the rows of these exponents
+ * the build folder. Takes some 20 minutes, or, by `tests/weights_table H ...`, less for the rows of these exponents
  * alone. */
 #include "fbm/tune.h"
 

@@ -1,0 +1,21 @@
+/* Layers over heights: normals, slope, curvature, ground kinds, colours, roughness. Each sample is made from the
+ * heights within one sample of it, so that windows made apart join; at the rim and beside voids from those that are
+ * there. */
+#ifndef SCENE_LAYERS_H
+#define SCENE_LAYERS_H
+
+#include "lib/talus.h"
+
+enum { SCENE_LAYER_CHANNELS = 4 }; /* at most */
+
+typedef struct scene_layer scene_layer;
+
+/* `kind`: a name of tl_layers(). Borrows `heights`. */
+scene_layer *scene_layer_create(const tl_source *heights, const char *kind, const tl_layer_options *options,
+                                tl_error *error);
+void scene_layer_destroy(scene_layer *layer);
+const tl_layer_kind *scene_layer_kind(const scene_layer *layer);
+/* The window's values, channel by channel; NaN where the height is void. Any number of threads. */
+tl_status scene_layer_read(const scene_layer *layer, tl_window window, float *out, tl_error *error);
+
+#endif
