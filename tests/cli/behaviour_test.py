@@ -802,7 +802,7 @@ def commands_in_readme():
 
 def commands_in_help(case):
     found = re.findall(r"^Try: (talus .*)$", case.run("help").out, flags=re.M)
-    for name in ("info", "simplify", "synth", "preview", "noise", "view"):
+    for name in ("info", "simplify", "synth", "stats", "preview", "noise", "view"):
         found += re.findall(r"^(?:Examples?:| +) (talus .*)$", case.run("help", name).out, flags=re.M)
     return found
 
@@ -825,7 +825,7 @@ def manuals_show_what_works(case):
 def man_page_knows_every_option(case):
     with open(os.path.join(ROOT, "doc", "talus.1.scd"), encoding="utf-8") as file:
         page = file.read()
-    for name in ("info", "simplify", "synth", "preview", "noise", "view", "fly"):
+    for name in ("info", "simplify", "synth", "stats", "preview", "noise", "view", "fly"):
         expect(f"*talus {name}*" in page and f"## {name}" in page, f"{name} is not in the man page")
         for option in re.findall(r"^ +(?:-\w, )?--([\w-]+)", case.run("help", name).out, flags=re.M):
             expect(f"--{option}*" in page, f"--{option} of {name} is not in the man page")
