@@ -794,6 +794,11 @@ TL_API tl_status tl_roam_look(tl_roam *roam, const tl_view *view, tl_lod_stats *
 TL_API tl_status tl_roam_mesh(tl_roam *roam, tl_mesh **out, tl_error *error);
 TL_API void tl_roam_destroy(tl_roam *roam);
 
+/* For each vertex of a mesh of tl_select, tl_roam_mesh or tl_framework_mesh the height of the middle of the edge that
+ * it splits: where the surface was before the vertex came. Moved from there to its own height over some frames, a
+ * vertex comes without a jump. Its own height where an end of that edge is not in the mesh. `out` has room for all. */
+TL_API tl_status tl_mesh_parent_heights(const tl_mesh *mesh, float *out, tl_error *error);
+
 /* How tl_view_write_picture draws. */
 typedef struct tl_view_picture_options {
     double sun_azimuth, sun_elevation; /* degrees, clockwise from north and above the horizon (0 ... 90), at the eye's

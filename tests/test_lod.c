@@ -686,6 +686,48 @@ static void threadsChangeNoByte(void **state)
     free_world(&w);
 }
 
+/* ---- Morphing ---- */
+
+static const tl_vertex *vertex_at(const tl_mesh *m, int32_t i, int32_t j)
+{
+    for (size_t k = 0; k < m->vertex_count; k++)
+        if (m->vertices[k].i == i && m->vertices[k].j == j)
+            return &m->vertices[k];
+    return NULL;
+}
+
+/* Without its finest vertices a surface is that of a level less; there the parents' heights lie on it. */
+static void parentsLieOnTheCoarserSurface(void **state)
+{
+    (void)state;
+    tl_error error;
+    world w = make_world(17, 17, 2, VOIDS_NONE, 10, 3);
+    tl_view view = view_over(&w, 0, -60, 300);
+    tl_lod_options options = {.pixel_error = 1e-6, .keep = 15};
+    tl_mesh *mesh = select_view(&w, &view, &options, NULL);
+    float *parents = malloc(mesh->vertex_count * sizeof *parents);
+    assert_int_equal(tl_mesh_parent_heights(mesh, parents, &error), TL_OK);
+    size_t moved = 0;
+    for (size_t k = 0; k < mesh->vertex_count; k++) {
+        const tl_vertex *v = &mesh->vertices[k];
+        bool across = (v->i & 1) && !(v->j & 1), down = !(v->i & 1) && (v->j & 1);
+        if (across || down) { /* a finest edge point, between the ends of a side */
+            const tl_vertex *a = vertex_at(mesh, v->i - across, v->j - down),
+                            *b = vertex_at(mesh, v->i + across, v->j + down);
+            assert_true(parents[k] == (float)(.5 * ((double)a->z + (double)b->z)));
+        } else if (v->i & 1) { /* a centre: the diagonal falls where its square's column plus row is even */
+            int rise = ((v->i - 1) / 2 + (v->j - 1) / 2) & 1 ? -1 : 1;
+            const tl_vertex *a = vertex_at(mesh, v->i - 1, v->j - rise), *b = vertex_at(mesh, v->i + 1, v->j + rise);
+            assert_true(parents[k] == (float)(.5 * ((double)a->z + (double)b->z)));
+        }
+        moved += parents[k] != v->z;
+    }
+    assert_true(moved > mesh->vertex_count / 2);
+    free(parents);
+    tl_mesh_destroy(mesh);
+    free_world(&w);
+}
+
 /* ---- Paths ---- */
 
 static void pathsPassTheirKeys(void **state)
@@ -752,6 +794,7 @@ int main(void)
         cmocka_unit_test(memoryIsKept),
         cmocka_unit_test(refusesWhatItCannotTake),
         cmocka_unit_test(threadsChangeNoByte),
+        cmocka_unit_test(parentsLieOnTheCoarserSurface),
         cmocka_unit_test(pathsPassTheirKeys),
         cmocka_unit_test(pathsWithoutTimesHaveOneSpeed),
     };
