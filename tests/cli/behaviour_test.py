@@ -802,7 +802,7 @@ def commands_in_readme():
 
 def commands_in_help(case):
     found = re.findall(r"^Try: (talus .*)$", case.run("help").out, flags=re.M)
-    for name in ("info", "simplify", "synth", "stats", "preview", "noise", "view"):
+    for name in ("info", "simplify", "synth", "preview", "noise", "view"):
         found += re.findall(r"^(?:Examples?:| +) (talus .*)$", case.run("help", name).out, flags=re.M)
     return found
 
