@@ -176,8 +176,9 @@ static inline const lod_request *lod_asked(const lod *l, size_t index)
 }
 /* Places vertices from `first` on. */
 tl_status lod_place(const lod *l, size_t first, tl_error *error);
-/* Places one. */
-void lod_place_vertex(const lod *l, uint32_t vertex);
+/* Places at most LOD_PLACED. */
+enum { LOD_PLACED = 128 };
+void lod_place_some(const lod *l, const uint32_t *vertices, size_t count);
 /* Marks what the marked vertices need, from fine to coarse. */
 tl_status lod_close(lod *l, tl_error *error);
 /* Takes all marks away. */

@@ -43,15 +43,12 @@ tl_status lod_ask(lod *l, int32_t x, int32_t y, tl_error *error)
     return scene_tiles_want(l->tiles, x, y, &to->slot, error);
 }
 
-enum { PLACED = 256 };
-
-/* Places vertices first ... first + count - 1. */
-static void place(const lod *l, size_t first, size_t count)
+void lod_place_some(const lod *l, const uint32_t *vertices, size_t count)
 {
-    double i[PLACED] = {0}, j[PLACED] = {0}, xyz[PLACED][3];
-    float z[PLACED] = {0};
+    double i[LOD_PLACED] = {0}, j[LOD_PLACED] = {0}, xyz[LOD_PLACED][3];
+    float z[LOD_PLACED] = {0};
     for (size_t k = 0; k < count; k++) {
-        const lod_vertex *v = lod_at(l, (uint32_t)(first + k));
+        const lod_vertex *v = lod_at(l, vertices[k]);
         i[k] = (double)(v->x < l->right ? v->x : l->right) / l->cell;
         j[k] = (double)(v->y < l->bottom ? v->y : l->bottom) / l->cell;
         z[k] = isnan(v->z) ? l->filling : v->z;
@@ -59,12 +56,7 @@ static void place(const lod *l, size_t first, size_t count)
     scene_view_place(l->view, count, i, j, z, xyz);
     for (size_t k = 0; k < count; k++)
         for (int a = 0; a < 3; a++)
-            lod_at(l, (uint32_t)(first + k))->at[a] = (float)(xyz[k][a] - l->camera->eye[a]);
-}
-
-void lod_place_vertex(const lod *l, uint32_t vertex)
-{
-    place(l, vertex, 1);
+            lod_at(l, vertices[k])->at[a] = (float)(xyz[k][a] - l->camera->eye[a]);
 }
 
 typedef struct placing {
@@ -78,8 +70,11 @@ static tl_status place_item(void *context, tl_parallel *loop, uint64_t item, uns
     (void)worker;
     (void)error;
     const placing *self = context;
-    size_t first = self->first + item * PLACED, left = self->l->vertices.count - first;
-    place(self->l, first, left < PLACED ? left : PLACED);
+    size_t first = self->first + item * LOD_PLACED, count = 0;
+    uint32_t vertices[LOD_PLACED];
+    for (; count < LOD_PLACED && first + count < self->l->vertices.count; count++)
+        vertices[count] = (uint32_t)(first + count);
+    lod_place_some(self->l, vertices, count);
     return TL_OK;
 }
 
@@ -89,9 +84,9 @@ tl_status lod_place(const lod *l, size_t first, tl_error *error)
     size_t count = l->vertices.count - first;
     tl_run quiet = l->run ? *l->run : (tl_run){0};
     quiet.progress = NULL;
-    if (count <= 4 * PLACED)
+    if (count <= 4 * LOD_PLACED)
         quiet.threads = 1;
-    return tl_parallel_for(&quiet, (count + PLACED - 1) / PLACED, 0, place_item, &self, error);
+    return tl_parallel_for(&quiet, (count + LOD_PLACED - 1) / LOD_PLACED, 0, place_item, &self, error);
 }
 
 /* Makes a vertex of what was asked for, where it can be one. */

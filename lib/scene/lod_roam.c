@@ -360,11 +360,18 @@ static tl_status place_item(void *context, tl_parallel *loop, uint64_t item, uns
     const tl_roam *r = context;
     unsigned char *places = r->places.items;
     size_t end = (size_t)(item + 1) * TESTED < r->places.count ? (size_t)(item + 1) * TESTED : r->places.count;
-    for (size_t k = (size_t)item * TESTED; k < end; k++)
-        if (places[k]) {
-            lod_place_vertex(&r->l, (uint32_t)k);
-            places[k] = 0;
+    uint32_t wanted[LOD_PLACED];
+    size_t count = 0;
+    for (size_t k = (size_t)item * TESTED; k < end; k++) {
+        if (places[k])
+            wanted[count++] = (uint32_t)k;
+        places[k] = 0;
+        if (count == LOD_PLACED) {
+            lod_place_some(&r->l, wanted, count);
+            count = 0;
         }
+    }
+    lod_place_some(&r->l, wanted, count);
     return TL_OK;
 }
 
@@ -415,7 +422,6 @@ static tl_status split_node(tl_roam *r, uint32_t index, tl_error *error)
         node_at(r, index)->stuck = true;
         return hold_opposite(r, index, error);
     }
-    lod_place_vertex(&r->l, middle);
     status = new_pair(r, &pair, error);
     if (status != TL_OK)
         return status;
@@ -423,9 +429,39 @@ static tl_status split_node(tl_roam *r, uint32_t index, tl_error *error)
     begin_node(r, pair, (lod_triangle){t.apex, t.a, middle, t.block, 0}, depth);
     begin_node(r, pair + 1, (lod_triangle){t.b, t.apex, middle, t.block, 0}, depth);
     node_at(r, index)->children = pair;
+    ((unsigned char *)r->places.items)[middle] = 1;
     r->split++;
     status = push(&r->next, pair, error);
     return status == TL_OK ? push(&r->next, pair + 1, error) : status;
+}
+
+static tl_status place_busy_item(void *context, tl_parallel *loop, uint64_t item, unsigned worker, tl_error *error)
+{
+    (void)loop;
+    (void)worker;
+    (void)error;
+    const tl_roam *r = context;
+    size_t first = (size_t)item * LOD_PLACED, left = r->busy.count - first;
+    lod_place_some(&r->l, numbers(&r->busy) + first, left < LOD_PLACED ? left : LOD_PLACED);
+    return TL_OK;
+}
+
+/* Places the middles that the queue was split at, each once: some are held since another view. */
+static tl_status place_middles(tl_roam *r, tl_error *error)
+{
+    unsigned char *places = r->places.items;
+    tl_status status = TL_OK;
+    r->busy.count = 0;
+    for (size_t k = 0; k < r->next.count && status == TL_OK; k += 2) {
+        uint32_t middle = node_at(r, numbers(&r->next)[k])->triangle.apex;
+        if (places[middle])
+            status = push(&r->busy, middle, error);
+        places[middle] = 0;
+    }
+    tl_run run = quiet_run(r, r->busy.count);
+    return status == TL_OK
+               ? tl_parallel_for(&run, (r->busy.count + LOD_PLACED - 1) / LOD_PLACED, 0, place_busy_item, r, error)
+               : status;
 }
 
 /* Splits the nodes of the queue, in one go, and tests what comes of it. */
@@ -442,6 +478,8 @@ static tl_status split_batch(tl_roam *r, tl_error *error)
     r->next.count = 0;
     for (size_t k = 0; k < r->queue.count && status == TL_OK; k++)
         status = split_node(r, numbers(&r->queue)[k], error);
+    if (status == TL_OK)
+        status = place_middles(r, error);
     return status == TL_OK ? test_nodes(r, &r->next, error) : status;
 }
 
