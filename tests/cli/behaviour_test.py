@@ -819,7 +819,7 @@ def manuals_show_what_works(case):
         if "-o" in words:
             expect(case.start(*words, "-q", "--overwrite", stderr=subprocess.DEVNULL).wait(120) == 0, line)
         else:
-            case.run(*words)
+            case.run(*words, *(["--overwrite"] if "--picture" in words else []))
 
 
 def man_page_knows_every_option(case):
