@@ -8,7 +8,7 @@
 #include <string.h>
 
 /* Squares are divided until they look so small, radians. */
-static const double SMALL = .03;
+static const double SMALL = .04;
 /* Blocks are read together up to so many times the distance of the nearest. */
 static const double FARTHER = 1.3;
 

@@ -334,7 +334,7 @@ static bool is_stale(const tl_roam *r, const node *n)
         return false;
     double moved = r->moved - (double)n->moved, turned = r->turned - (double)n->turned;
     double rounded = 1e-6 * r->moved + 1e-6 * r->turned * (double)n->far;
-    return moved + 1.1 * turned * ((double)n->far + moved) + UNSURE * (double)n->far + rounded >= (double)n->margin;
+    return moved + 1.01 * turned * ((double)n->far + moved) + UNSURE * (double)n->far + rounded >= (double)n->margin;
 }
 
 static tl_status list_stale(tl_roam *r, bool all, tl_error *error)
