@@ -13,6 +13,7 @@
 #include "lib/scene/lod.h"
 
 #include <math.h>
+#include <stdatomic.h>
 #include <string.h>
 
 enum { TESTED = 512, REFERENCES = 3, RIDGE_RULE = 3 /* log2 of TL_CULL_RIDGE */ };
@@ -46,6 +47,7 @@ struct tl_roam {
     lod_list stale, queue, next;        /* uint32_t: nodes */
     lod_list leaves;                    /* lod_leaf */
     bool seen_any, failed;
+    atomic_bool enters; /* some of the tested nodes have no block yet, and may be seen */
     double moved, turned;
     tl_view view; /* the last one */
     scene_camera camera;
@@ -251,7 +253,7 @@ typedef struct testing {
     const lod_list *list;
 } testing;
 
-static void judge(const tl_roam *r, node *n)
+static void judge(tl_roam *r, node *n)
 {
     lod_verdict v = lod_test(&r->l, &n->triangle, n->depth, r->l.rules);
     n->state = v.state;
@@ -263,8 +265,10 @@ static void judge(const tl_roam *r, node *n)
     n->moved = (float)r->moved;
     n->turned = (float)r->turned;
     /* nothing is known of it yet but that it may be seen */
-    if (n->depth == lod_block_depth(&r->l) && n->triangle.block == LOD_NONE)
+    if (n->depth == lod_block_depth(&r->l) && n->triangle.block == LOD_NONE) {
         n->margin = -1;
+        atomic_store(&r->enters, true);
+    }
 }
 
 static tl_status test_item(void *context, tl_parallel *loop, uint64_t item, unsigned worker, tl_error *error)
@@ -302,7 +306,7 @@ static tl_status enter_blocks(tl_roam *r, const lod_list *list, tl_error *error)
     int depth = lod_block_depth(&r->l);
     tl_status status = TL_OK;
     r->busy.count = 0;
-    for (size_t k = 0; k < list->count && status == TL_OK; k++) {
+    for (size_t k = 0; k < list->count && status == TL_OK && r->enters; k++) {
         node *n = node_at(r, numbers(list)[k]);
         if (n->depth == depth && n->triangle.block == LOD_NONE && n->state >= LOD_LEAF) {
             status = lod_want_block(&r->l, &n->triangle, error);
@@ -319,6 +323,7 @@ static tl_status enter_blocks(tl_roam *r, const lod_list *list, tl_error *error)
 
 static tl_status test_nodes(tl_roam *r, const lod_list *list, tl_error *error)
 {
+    atomic_store(&r->enters, false);
     tl_status status = test_list(r, list, error);
     return status == TL_OK ? enter_blocks(r, list, error) : status;
 }
@@ -388,8 +393,8 @@ static tl_status hold_opposite(tl_roam *r, uint32_t index, tl_error *error)
 {
     node *n = node_at(r, index);
     int32_t x, y;
-    if (n->state < LOD_LEAF || n->children != LOD_NONE || n->held != LOD_NONE ||
-        !lod_opposite(&r->l, &n->triangle, &x, &y))
+    if (n->depth != 2 * (r->l.lattice_log - r->l.levels) || n->state < LOD_LEAF || n->children != LOD_NONE ||
+        n->held != LOD_NONE || !lod_opposite(&r->l, &n->triangle, &x, &y))
         return TL_OK;
     tl_status status = want(r, x, y, error);
     if (status == TL_OK)
