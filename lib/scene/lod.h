@@ -50,10 +50,11 @@ typedef struct lod_verdict {
     unsigned char rule;  /* tl_culling, of a hidden one */
     signed char step;    /* of its chunk: see lod_triangle */
     float priority;      /* it wants to be split where fewer pixels are allowed; infinite: always, -1: never */
-    /* The verdict stays what it is while the eye has moved by less than `margin`, in metres, where turning by an angle
-     * counts as moving by that times `far`; for an allowed pixel error that stays. Below 0: it may change at any time.
-     */
-    float margin, far;
+    /* The verdict stays what it is while the eye has moved by less than `margin`, in metres, and by less than each of
+     * `beside`, where the planes' turning counts, by the change of their normals times `far`: [0] the near plane and
+     * the screen's left and right, [1] its top and bottom. For an allowed pixel error that stays. Below 0: it may
+     * change at any time. Ridges are apart: see lod_at_ridge. */
+    float margin, beside[2], far;
     float pixels; /* of its error; infinite where it must be split */
 } lod_verdict;
 

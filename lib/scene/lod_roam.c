@@ -28,10 +28,10 @@ typedef struct node {
     lod_triangle triangle;
     uint32_t children; /* the first of two; LOD_NONE: a leaf */
     uint32_t held;     /* a vertex that its drawing needs, or LOD_NONE */
-    float priority, pixels, margin, far;
-    float moved, turned; /* the eye's, when its verdict was made */
-    unsigned char state; /* lod_state; whether it is split is told by `children` */
-    unsigned char rule;  /* index of what hides it */
+    float priority, pixels, margin, beside[2], far;
+    float moved, turned[2]; /* the eye's way and the planes', when its verdict was made */
+    unsigned char state;    /* lod_state; whether it is split is told by `children` */
+    unsigned char rule;     /* index of what hides it */
     signed char depth;
     bool live, stuck; /* stuck: its middle is in a void */
 } node;
@@ -47,9 +47,10 @@ struct tl_roam {
     lod_list stale, queue, next;        /* uint32_t: nodes */
     lod_list leaves;                    /* lod_leaf */
     bool seen_any, failed;
-    atomic_bool enters; /* some of the tested nodes have no block yet, and may be seen */
-    double moved, turned;
-    tl_view view; /* the last one */
+    atomic_bool enters;      /* some of the tested nodes have no block yet, and may be seen */
+    double moved, turned[2]; /* the eye's way, in metres; of normals' ends: see lod_verdict */
+    double planes[5][3];     /* of the last view */
+    tl_view view;            /* the last one */
     scene_camera camera;
     double references[REFERENCES][3];
     int budget_at; /* where the last search ended */
@@ -261,9 +262,10 @@ static void judge(tl_roam *r, node *n)
     n->priority = v.priority;
     n->pixels = v.pixels;
     n->margin = v.margin;
+    n->beside[0] = v.beside[0], n->beside[1] = v.beside[1];
     n->far = v.far;
     n->moved = (float)r->moved;
-    n->turned = (float)r->turned;
+    n->turned[0] = (float)r->turned[0], n->turned[1] = (float)r->turned[1];
     /* nothing is known of it yet but that it may be seen */
     if (n->depth == lod_block_depth(&r->l) && n->triangle.block == LOD_NONE) {
         n->margin = -1;
@@ -337,9 +339,15 @@ static bool is_stale(const tl_roam *r, const node *n)
         return true;
     if (behind)
         return false;
-    double moved = r->moved - (double)n->moved, turned = r->turned - (double)n->turned;
-    double rounded = 1e-6 * r->moved + 1e-6 * r->turned * (double)n->far;
-    return moved + 1.01 * turned * ((double)n->far + moved) + UNSURE * (double)n->far + rounded >= (double)n->margin;
+    double far = (double)n->far, moved = r->moved - (double)n->moved + UNSURE * far + 1e-6 * r->moved;
+    if (moved >= (double)n->margin)
+        return true;
+    for (int k = 0; k < 2; k++) {
+        double turned = r->turned[k] - (double)n->turned[k] + 1e-6 * r->turned[k];
+        if (moved + turned * (far + moved) >= (double)n->beside[k])
+            return true;
+    }
+    return false;
 }
 
 static tl_status list_stale(tl_roam *r, bool all, tl_error *error)
@@ -579,11 +587,11 @@ static bool is_rigid(const double a[REFERENCES][3], const double b[REFERENCES][3
     return true;
 }
 
-/* How far the eye went from the last view to this, and by which angle it turned at most; false: no telling. */
-static bool compare_views(const tl_roam *r, const double now[REFERENCES][3], double *moved, double *turned)
+/* How far the eye went from the last view to this, and the planes' normals; false: no telling. */
+static bool compare_views(const tl_roam *r, const double now[REFERENCES][3], double *moved, double turned[2])
 {
     const scene_camera *before = &r->camera, *after = r->l.camera;
-    double from[3][3], to[3][3], relative[3], eye[3], step[3], trace = 0;
+    double from[3][3], to[3][3], relative[3], eye[3], step[3];
     if (before->focal != after->focal || before->width != after->width || before->height != after->height ||
         !is_rigid(r->references, now) || !axes_of(r->references, from) || !axes_of(now, to))
         return false;
@@ -592,16 +600,13 @@ static bool compare_views(const tl_roam *r, const double now[REFERENCES][3], dou
     for (int k = 0; k < 3; k++)
         step[k] = now[0][k] + eye[k] - after->eye[k];
     *moved = sqrt(dot(step, step));
-    const double *const old_axes[3] = {before->right, before->down, before->ahead}, *const new_axes[3] = {after->right,
-                                                                                                          after->down,
-                                                                                                          after->ahead};
-    for (int k = 0; k < 3; k++) {
+    turned[0] = turned[1] = 0;
+    for (int k = 0; k < 5; k++) {
         double there[3];
-        turn(from, to, old_axes[k], there);
-        trace += fmin(1, dot(there, new_axes[k]));
+        turn(from, to, r->planes[k], there);
+        sub(there, r->l.planes[k], there);
+        turned[k > 2] = fmax(turned[k > 2], sqrt(dot(there, there)) + 1e-7);
     }
-    /* an angle t has a trace of 1 + 2 cos t; 4 sin^2(t / 2) = 3 - trace */
-    *turned = 2 * asin(fmin(1, sqrt(fmax(0, 3 - trace)) / 2)) + 1e-7;
     return true;
 }
 
@@ -616,11 +621,13 @@ static void place_references(const tl_roam *r, const scene_view *view, double ou
 /* Whether all verdicts are to be made again. */
 static bool move(tl_roam *r)
 {
-    double now[REFERENCES][3], moved = 0, turned = 0;
+    double now[REFERENCES][3], moved = 0, turned[2] = {0, 0};
     place_references(r, r->l.view, now);
-    bool known = r->seen_any && !r->options.budget && compare_views(r, now, &moved, &turned);
+    bool known = r->seen_any && !r->options.budget && compare_views(r, now, &moved, turned);
     r->moved = known ? r->moved + moved : 0;
-    r->turned = known ? r->turned + turned : 0;
+    for (int k = 0; k < 2; k++)
+        r->turned[k] = known ? r->turned[k] + turned[k] : 0;
+    memcpy(r->planes, r->l.planes, sizeof r->planes);
     r->camera = *r->l.camera;
     memcpy(r->references, now, sizeof now);
     return !known;

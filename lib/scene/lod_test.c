@@ -250,22 +250,26 @@ static subject subject_of(const lod *l, const lod_triangle *t, int depth)
 /* Where it is, and how near. */
 typedef struct sight {
     double distance;
-    unsigned hidden;    /* tl_culling */
-    double margin, far; /* as in lod_verdict, of being hidden or not */
+    unsigned hidden;               /* tl_culling */
+    double margin, beside[2], far; /* as in lod_verdict, of being hidden or not */
 } sight;
 
-/* Beside the screen, by a ball around it. *margin: how far from changing. */
-static bool beside(const lod *l, const double middle[3], double radius, double *margin)
+/* Beside the screen, by a ball around it. `margins`: how far from changing, as in lod_verdict. */
+static bool beside(const lod *l, const double middle[3], double radius, double margins[2])
 {
-    double inside = HUGE_VAL, outside = -HUGE_VAL;
+    double inside[2] = {HUGE_VAL, HUGE_VAL};
     for (int k = 0; k < 5; k++) {
         const double *n = l->planes[k];
         double d = n[0] * middle[0] + n[1] * middle[1] + n[2] * middle[2] + radius;
-        inside = fmin(inside, d);
-        outside = fmax(outside, -d);
+        inside[k > 2] = d < inside[k > 2] ? d : inside[k > 2];
     }
-    *margin = inside < 0 ? outside : inside;
-    return inside < 0;
+    margins[0] = inside[0], margins[1] = inside[1];
+    if (inside[0] >= 0 && inside[1] >= 0)
+        return false;
+    int most = inside[1] < inside[0]; /* outside of one plane is enough */
+    margins[most] = -inside[most];
+    margins[!most] = HUGE_VAL;
+    return true;
 }
 
 static double steepness(const lod *l, const subject *s)
@@ -292,7 +296,7 @@ static sight look_at_box(const lod *l, const subject *s, unsigned rules)
 {
     scene_extent extent = extent_of(l, s);
     scene_box box;
-    sight out = {.margin = -1};
+    sight out = {.margin = -1, .beside = {HUGE_VAL, HUGE_VAL}};
     scene_view_box(l->view, &extent, &box);
     out.hidden = scene_view_hides(l->view, &extent, &box, steepness(l, s),
                                   rules & (TL_CULL_FRUSTUM | TL_CULL_BACK | TL_CULL_HORIZON));
@@ -338,9 +342,9 @@ static sight look_at(const lod *l, const subject *s, unsigned rules)
     if (s->void_corners) /* the other diagonal may be drawn, by whichever half of the square: see both alike */
         to_apex = 1.1 * to_a;
     double radius = MORE * sqrt(fmax(to_a, to_apex)) + CURVING * s->leg * s->leg + s->reach * l->unit + 1e-6 * far;
-    sight out = {.distance = fmax(0, far - radius), .margin = HUGE_VAL, .far = far};
+    sight out = {.distance = fmax(0, far - radius), .margin = HUGE_VAL, .beside = {HUGE_VAL, HUGE_VAL}, .far = far};
     bool box = !(s->depth & 1) && rules & (TL_CULL_BACK | TL_CULL_HORIZON) && s->leg > WORTH_IT * far;
-    if (rules & TL_CULL_FRUSTUM && beside(l, middle, radius, &out.margin))
+    if (rules & TL_CULL_FRUSTUM && beside(l, middle, radius, out.beside))
         out.hidden = TL_CULL_FRUSTUM;
     else if (box)
         out.hidden = look_at_box(l, s, rules & ~(unsigned)TL_CULL_FRUSTUM).hidden;
@@ -407,18 +411,19 @@ lod_verdict lod_test(const lod *l, const lod_triangle *t, int depth, unsigned ru
     lod_middle(l, t, &x, &y);
     bool ends = stage < 0; /* legs of 1 */
     if (s.at.outside)
-        return (lod_verdict){.state = LOD_DROPPED, .priority = -1, .margin = HUGE_VALF};
+        return (lod_verdict){
+            .state = LOD_DROPPED, .priority = -1, .margin = HUGE_VALF, .beside = {HUGE_VALF, HUGE_VALF}};
     find_error(l, &s, x / l->cell, y / l->cell);
     if (s.void_corners && (level > 0 || s.error < HUGE_VAL) && (level <= 0 || s.void_corners > 1))
-        return (lod_verdict){.state = LOD_DROPPED, .priority = -1, .margin = HUGE_VALF};
+        return (lod_verdict){
+            .state = LOD_DROPPED, .priority = -1, .margin = HUGE_VALF, .beside = {HUGE_VALF, HUGE_VALF}};
     sight seen = look_at(l, &s, rules);
     if (seen.hidden)
         return (lod_verdict){.state = LOD_HIDDEN,
                              .rule = (unsigned char)seen.hidden,
                              .priority = -1,
-                             .margin = seen.hidden == TL_CULL_RIDGE     ? HUGE_VALF
-                                       : seen.hidden == TL_CULL_FRUSTUM ? (float)seen.margin
-                                                                        : -1,
+                             .margin = seen.hidden & (TL_CULL_RIDGE | TL_CULL_FRUSTUM) ? (float)seen.margin : -1,
+                             .beside = {(float)seen.beside[0], (float)seen.beside[1]},
                              .far = (float)seen.far};
     bool forced = !(s.error < HUGE_VAL), can = !ends && !(level > 0 && s.void_corners);
     double error = s.error * l->unit;
@@ -427,6 +432,7 @@ lod_verdict lod_test(const lod *l, const lod_triangle *t, int depth, unsigned ru
                                    : forced ? HUGE_VALF
                                             : priority_of(l, depth, error, seen.distance),
                        .margin = (float)seen.margin,
+                       .beside = {(float)seen.beside[0], (float)seen.beside[1]},
                        .far = (float)seen.far};
     if (can && !forced && level <= l->finest)
         out.margin = l->options->band_count ? -1 : (float)fmin(seen.margin, fabs(seen.distance - l->near * error));
