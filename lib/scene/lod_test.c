@@ -19,6 +19,9 @@ static const double QUANTILE = 1.8;
 static const double STEEPEST = 5;
 /* Triangles that look larger than this, radians, are tried by the rules that cost much; smaller ones lie in such. */
 static const double WORTH_IT = .05;
+/* Triangles below the samples are tried for being beside the screen at every so many depths only, where they are eight
+ * times as long: a few pixels more at the rim of the screen, but most verdicts do not depend on where the eye turns. */
+enum { TRIED = 6 };
 /* Legs (metres) and widths (degrees of longitude) up to which the triangle's corners tell where it is. */
 static const double LONGEST = 2e4, WIDEST = 8;
 /* A lattice line of at most WIDEST degrees is off its chord by at most tan(WIDEST / 4) / 2 of it; and one of `leg`
@@ -344,7 +347,8 @@ static sight look_at(const lod *l, const subject *s, unsigned rules)
     double radius = MORE * sqrt(fmax(to_a, to_apex)) + CURVING * s->leg * s->leg + s->reach * l->unit + 1e-6 * far;
     sight out = {.distance = fmax(0, far - radius), .margin = HUGE_VAL, .beside = {HUGE_VAL, HUGE_VAL}, .far = far};
     bool box = !(s->depth & 1) && rules & (TL_CULL_BACK | TL_CULL_HORIZON) && s->leg > WORTH_IT * far;
-    if (rules & TL_CULL_FRUSTUM && beside(l, middle, radius, out.beside))
+    bool tried = level_of(l, s->depth) <= 0 || s->depth % TRIED == 0;
+    if (tried && rules & TL_CULL_FRUSTUM && beside(l, middle, radius, out.beside))
         out.hidden = TL_CULL_FRUSTUM;
     else if (box)
         out.hidden = look_at_box(l, s, rules & ~(unsigned)TL_CULL_FRUSTUM).hidden;
