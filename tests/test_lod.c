@@ -657,10 +657,10 @@ static void refusesWhatItCannotTake(void **state)
     }
     assert_int_equal(tl_select(w.dem, w.dem, w.pyramid, &view, NULL, &mesh, NULL, &error), TL_ERROR_ARGUMENT);
     const tl_lod_options wrong[] = {{.pixel_error = -1},
-                                    {.pixel_error = NAN},
-                                    {.pixel_error = INFINITY},
+                                    {.pixel_error = (double)NAN},
+                                    {.pixel_error = (double)INFINITY},
                                     {.band_count = 2, .bands = {5, 5}},
-                                    {.band_count = 1, .bands = {NAN}},
+                                    {.band_count = 1, .bands = {(double)NAN}},
                                     {.band_count = 1, .bands = {5}, .budget = 100}};
     for (size_t k = 0; k < sizeof wrong / sizeof *wrong; k++)
         assert_int_equal(tl_select(w.field, w.dem, w.pyramid, &view, &wrong[k], &mesh, NULL, &error),
