@@ -45,7 +45,10 @@ static const char *const coding_names[] = {
 static tl_rounding file_rounding(const settings *set, const tl_source *dem)
 {
     tl_write_options options = {.frame = (tl_frame)set->frame, .coding = (tl_mesh_coding)set->coding};
-    return tl_write_rounding(&dem->info, set->common.output, &options);
+    tl_rounding rounding = tl_write_rounding(&dem->info, set->common.output, &options);
+    if (set->coding != TL_CODING_PLAIN) /* steps reach down to the floor, too */
+        rounding.upright += 0.51 / 65535 * (set->skirt + set->base);
+    return rounding;
 }
 
 static int report_check(const settings *set, const tl_mesh_report *check)
@@ -60,8 +63,8 @@ static int report_check(const settings *set, const tl_mesh_report *check)
     if (!(check->max_error <= set->max_error)) {
         complain(
             "%s: its numbers are %.3g more than %.9g from the DEM at column %lld, row %lld; if they are too coarse "
-            "for that, use .ply with --frame projected or pixel; there it would be a fault of talus, please "
-            "report it",
+            "for that, use .ply with --frame projected or pixel (and no --coding); there it would be a fault of "
+            "talus, please report it",
             set->common.output, check->max_error - set->max_error, set->max_error, (long long)check->worst_i,
             (long long)check->worst_j);
         return EXIT_FAILED;
@@ -98,7 +101,8 @@ static int write_and_check(const settings *set, const tl_source *dem, tl_mesh *m
     if (add_below(set, mesh, &error) != TL_OK || tl_write_mesh(mesh, set->common.output, &options, &error) != TL_OK)
         return command_failed(bar, &error);
     progress_end(bar);
-    if (!set->verify)
+    /* steps of 16 bits may be too coarse for the bound, however many samples are kept */
+    if (!set->verify && set->coding == TL_CODING_PLAIN)
         return EXIT_DONE;
     progress_stage(bar, "verifying");
     int status = EXIT_DONE;

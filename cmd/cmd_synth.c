@@ -54,9 +54,12 @@ static tl_status write_preset(const settings *set, const tl_source *made, const 
     tl_status status = tl_write_preset(made, set->common.output, &options, &report, error);
     if (status != TL_OK)
         return status;
-    command_say(&set->common, "%s: %lld x %lld tiles of %lld x %lld samples, from column %lld, row %lld; %g ... %g",
+    double share = (double)report.window.width * (double)report.window.height /
+                   ((double)made->info.width * (double)made->info.height);
+    command_say(&set->common,
+                "%s: %lld x %lld tiles of %lld x %lld samples, from column %lld, row %lld, %.3g %% of all; %g ... %g",
                 set->preset, (long long)report.columns, (long long)report.rows, (long long)report.tile_width,
-                (long long)report.tile_height, (long long)report.window.x, (long long)report.window.y,
+                (long long)report.tile_height, (long long)report.window.x, (long long)report.window.y, 100 * share,
                 (double)report.low, (double)report.high);
     for (char *rest, *line = strtok_r(report.import, "\n", &rest); line; line = strtok_r(NULL, "\n", &rest))
         command_say(&set->common, "  %s", line);
@@ -183,6 +186,10 @@ static bool mip_ok(const settings *set)
 {
     if (!layers_ok(set))
         return false;
+    if (set->preset && (set->mip || set->compression)) {
+        complain("--preset decides how files are written; leave --mip and --compression away");
+        return false;
+    }
     if (set->tile && !set->preset) {
         complain("--tile is for --preset; give that too, or leave it away");
         return false;

@@ -1114,7 +1114,8 @@ typedef struct tl_preset_report {
  * middle, all over one range of heights, in the order of rows and by the names that the program wants: NAME.r16 for one
  * tile, NAME_x0_y0.r16 and so on for more; and NAME.json, which tells where they lie and what their numbers mean. Voids
  * become the lowest height, since no program knows them. TL_ERROR_ARGUMENT where the source is smaller than the
- * smallest tile. When it fails nothing is left of what was not there before. */
+ * smallest tile, and where its rows do not run along the axes. When it fails nothing new is left; with `overwrite` some
+ * tiles may have been replaced. */
 TL_API tl_status tl_write_preset(const tl_source *source, const char *path, const tl_preset_options *options,
                                  tl_preset_report *out, tl_error *error);
 

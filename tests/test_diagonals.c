@@ -1,3 +1,5 @@
+#include "dem/crs.h"
+#include "lib/base/georef.h"
 #include "lib/talus.h"
 
 #include <math.h>
@@ -141,6 +143,46 @@ static void boundHoldsAndAllElseIsLower(void **state)
     assert_true(turned > 1000 && held > 100); /* there was something to see */
 }
 
+/* Wide cells on the ellipsoid, where triangles sag under the ground by metres: the bound holds there. */
+static void boundHoldsOnTheEllipsoid(void **state)
+{
+    (void)state;
+    tl_crs *crs = NULL;
+    assert_int_equal(dem_crs_from_text("EPSG:32633", "test", &crs, NULL), TL_OK);
+    uint64_t turned = 0, held = 0;
+    for (int round = 0; round < 4; round++) {
+        grid of = {130, 110, malloc(130 * 110 * sizeof(float))};
+        double cell = round & 1 ? 4000 : 1500;
+        for (int k = 0; k < 130 * 110; k++)
+            of.z[k] = (float)(30 * sin(k % 130 * .11 + round) * cos(k / 130 * .17) + 0.02 * (k * 7 % 101));
+        tl_source *source = open_grid(&of);
+        const double transform[6] = {400000 - 65 * cell, cell, 0, 5100000, 0, -cell};
+        memcpy(source->info.georef.transform, transform, sizeof transform);
+        source->info.georef.located = true;
+        source->info.georef.crs = crs;
+        source->info.georef.cell_x = source->info.georef.cell_y = cell;
+        tl_framework_options build = {.max_error = 12, .frame = TL_FRAME_ENU};
+        tl_framework *framework = tl_framework_build(source, &build, NULL);
+        tl_mesh *mesh = NULL;
+        tl_mesh_report report;
+        assert_int_equal(tl_framework_mesh(framework, &mesh, NULL), TL_OK);
+        tl_diagonal_options options = {.max_error = 12, .frame = TL_FRAME_ENU};
+        tl_diagonal_report out;
+        assert_int_equal(tl_mesh_lower_diagonals(mesh, source, &options, &out, NULL), TL_OK);
+        assert_int_equal(tl_mesh_verify_in(mesh, source, TL_FRAME_ENU, NULL, &report, NULL), TL_OK);
+        if (!(report.max_error <= 12))
+            fail_msg("cells of %g: %g instead of 12", cell, report.max_error);
+        turned += out.turned, held += out.held;
+        tl_mesh_destroy(mesh);
+        tl_framework_destroy(framework);
+        tl_source_destroy(source);
+        free(of.z);
+    }
+    if (!(turned > 200 && held > 20))
+        fail_msg("%d turned, %d held", (int)turned, (int)held);
+    tl_crs_release(crs);
+}
+
 static void saddleIsCutLow(void **state)
 {
     (void)state;
@@ -186,6 +228,7 @@ int main(void)
 {
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(boundHoldsAndAllElseIsLower),
+        cmocka_unit_test(boundHoldsOnTheEllipsoid),
         cmocka_unit_test(saddleIsCutLow),
         cmocka_unit_test(threadsChangeNothing),
     };

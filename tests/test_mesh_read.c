@@ -1,4 +1,6 @@
 #define _GNU_SOURCE /* mkdtemp */
+#include "dem/crs.h"
+#include "lib/base/georef.h"
 #include "lib/out/mesh_read.h"
 #include "lib/talus.h"
 
@@ -211,6 +213,50 @@ static void stepsAddWhatIsSaid(void **state)
     }
 }
 
+/* Hills on the ellipsoid, flat ones and steep ones, of narrow cells and wide ones: a mesh that counts the steps keeps
+ * its bound by the file's own numbers. */
+static void boundsCountTheSteps(void **state)
+{
+    (void)state;
+    const char *path = path_of("glb");
+    tl_crs *crs = NULL;
+    assert_int_equal(dem_crs_from_text("EPSG:32633", "test", &crs, NULL), TL_OK);
+    for (int round = 0; round < 6; round++) {
+        grid of = {200, 150, malloc(200 * 150 * sizeof(float))};
+        double cell = round & 1 ? 900 : 30, high = round < 2 ? 0.02 : round < 4 ? 0.5 : 8;
+        for (int k = 0; k < 200 * 150; k++)
+            of.z[k] = (float)(cell * high * sin(k % 200 * .3) * cos(k / 200 * .21));
+        tl_source *source = open_grid(&of);
+        const double transform[6] = {400000, cell, 0, 5100000, 0, -cell};
+        memcpy(source->info.georef.transform, transform, sizeof transform);
+        source->info.georef.located = true;
+        source->info.georef.crs = crs;
+        source->info.georef.cell_x = source->info.georef.cell_y = cell;
+        tl_write_options writing = {.overwrite = true, .coding = TL_CODING_QUANTIZED};
+        tl_framework_options options = {.max_error = cell * high * 0.06,
+                                        .rounding = tl_write_rounding(&source->info, path, &writing)};
+        tl_framework *framework = tl_framework_build(source, &options, NULL);
+        tl_mesh *mesh = NULL;
+        tl_mesh_report read;
+        tl_error error = {0};
+        assert_int_equal(tl_framework_mesh(framework, &mesh, NULL), TL_OK);
+        assert_true(mesh->vertex_count < 200 * 150); /* there was something to leave out */
+        if (tl_write_mesh(mesh, path, &writing, &error) != TL_OK ||
+            tl_mesh_verify_file(path, mesh, source, NULL, TL_FRAME_ENU, NULL, &read, &error) != TL_OK)
+            fail_msg("%s", error.text);
+        if (!(read.max_error <= options.max_error && read.max_error > options.max_error / 3))
+            fail_msg("cells of %g, heights of %g: %g instead of %g", cell, cell * high, read.max_error,
+                     options.max_error);
+        assert_int_equal(read.samples, 200 * 150);
+        tl_mesh_destroy(mesh);
+        tl_framework_destroy(framework);
+        tl_source_destroy(source);
+        free(of.z);
+    }
+    assert_int_equal(unlink(path), 0);
+    tl_crs_release(crs);
+}
+
 static size_t load(const char *path, unsigned char **bytes)
 {
     FILE *file = fopen(path, "rb");
@@ -274,8 +320,11 @@ static void damagedFilesAreRefusedOrRead(void **state)
 int main(void)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(filesAreAsFarFromTheDemAsTheirMeshes), cmocka_unit_test(filesTellWhatMemoryDoesNot),
-        cmocka_unit_test(samplesAreHeldToTheirOwnBounds),       cmocka_unit_test(stepsAddWhatIsSaid),
+        cmocka_unit_test(filesAreAsFarFromTheDemAsTheirMeshes),
+        cmocka_unit_test(filesTellWhatMemoryDoesNot),
+        cmocka_unit_test(samplesAreHeldToTheirOwnBounds),
+        cmocka_unit_test(stepsAddWhatIsSaid),
+        cmocka_unit_test(boundsCountTheSteps),
         cmocka_unit_test(damagedFilesAreRefusedOrRead),
     };
     return cmocka_run_group_tests(tests, make_folder, remove_folder);

@@ -338,7 +338,7 @@ static void plainNumbersAreThoseOfTheSidecar(void **state)
     free(raw);
     write_ok(p->source, in_folder(p, "b.r16"), NULL);
     unsigned char *values = load_exactly(p->path, 2 * WIDTH * HEIGHT);
-    json_t *json = json_load_file(in_folder(p, "b.json"), 0, NULL);
+    json_t *json = json_load_file(in_folder(p, "b.r16.json"), 0, NULL);
     double scale = json_real_value(json_object_get(json, "scale")),
            offset = json_real_value(json_object_get(json, "offset"));
     for (int k = 0; k < WIDTH * HEIGHT; k++) {

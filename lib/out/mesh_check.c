@@ -11,8 +11,9 @@
 #include <math.h>
 #include <string.h>
 
-/* A vertex of the file is at a sample if it is this near, in cells. */
-static const double NEAR = 0.05;
+/* A vertex of the file is at a sample if it is this near, in cells: no more than a quarter of one from it, and half a
+ * cell from every other. */
+static const double NEAR = 0.25;
 
 static const uint32_t NONE = UINT32_MAX;
 

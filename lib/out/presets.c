@@ -31,14 +31,14 @@ typedef struct engine {
     int (*tell)(const numbers *, char *, size_t);
 } engine;
 
-/* Landscapes of Unreal: quads of 63 a section, sections of 1 or 4 a component. A value is (v - 32768) / 128 times the
+/* Landscapes of Unreal: whole components of 1 or 4 sections of 63 or 127 quads. A value is (v - 32768) / 128 times the
  * scale's Z, in centimetres. */
 static int tell_unreal(const numbers *n, char *out, size_t room)
 {
     return snprintf(out, room,
                     "Landscape, Import from File: Scale X %.9g, Y %.9g, Z %.9g\n"
                     "Location Z %.9g (centimetres; the height of the value 32768)",
-                    100 * n->cell_x, 100 * n->cell_y, 100 * 128 * n->step, 100 * n->middle);
+                    100 * n->cell_x, 100 * n->cell_y, fmax(100 * 128 * n->step, 1e-3), 100 * n->middle);
 }
 
 /* Unity's first row is that at z = 0. */
@@ -54,10 +54,12 @@ static int tell_unity(const numbers *n, char *out, size_t room)
 static int tell_godot(const numbers *n, char *out, size_t room)
 {
     return snprintf(out, room,
-                    "Terrain3D importer: r16 range %.9g, %.9g; r16 size %lld, %lld; vertex spacing %.9g\n"
-                    "HTerrain importer: 16 bits, little endian, min height %.9g, max height %.9g; map scale %.9g, %.9g",
-                    n->low, n->high, (long long)n->width, (long long)n->height, n->cell_x, n->low, n->high, n->cell_x,
-                    n->cell_y);
+                    "Terrain3D importer: r16 range %.9g, %.9g; r16 size %lld, %lld; vertex spacing %.9g%s\n"
+                    "HTerrain importer: 16 bits, little endian, min height %.9g, max height %.9g; map scale X %.9g, "
+                    "Z %.9g",
+                    n->low, n->high, (long long)n->width, (long long)n->height, n->cell_x,
+                    fabs(n->cell_y / n->cell_x - 1) > 1e-3 ? " (it has but one: scale its Z by the cells' height)" : "",
+                    n->low, n->high, n->cell_x, n->cell_y);
 }
 
 static int tell_blender(const numbers *n, char *out, size_t room)
@@ -206,6 +208,7 @@ typedef struct writing {
     tl_preset_report *report;
     out_coding code;
     size_t done; /* tiles that have their names */
+    bool *older; /* by tile: replaced one that was there */
 } writing;
 
 /* "land.r16" to "land_x1_y0.r16", "land.json"; free it. */
@@ -242,6 +245,7 @@ static tl_window tile_window(const writing *w, size_t k)
 static tl_status write_tile(writing *w, size_t k, const tl_run *run, tl_error *error)
 {
     char *path = tile_name(w, k);
+    w->older[k] = path && access(path, F_OK) == 0;
     tl_output *output = path ? tl_output_open(path, w->options->overwrite, error) : NULL;
     tl_status status = output ? TL_OK : path ? TL_ERROR_IO : tl_fail_memory(error, w->path);
     if (status == TL_OK) {
@@ -261,12 +265,12 @@ static tl_status write_tile(writing *w, size_t k, const tl_run *run, tl_error *e
     return status;
 }
 
-/* Takes back what is there already. What was there before is lost then, where it was to be replaced. */
+/* Takes back what is there already, but for tiles that replaced others: these stay. */
 static void take_back(const writing *w)
 {
     for (size_t k = 0; k < w->done; k++) {
         char *path = tile_name(w, k);
-        if (path)
+        if (path && !w->older[k])
             unlink(path);
         free(path);
     }
@@ -394,6 +398,9 @@ static tl_status write_all(writing *w, tl_error *error)
     char *beside = name_of(w->path, "", ".json");
     tl_output *index = beside ? tl_output_open(beside, w->options->overwrite, error) : NULL;
     tl_status status = index ? find_range(w, error) : beside ? TL_ERROR_IO : tl_fail_memory(error, w->path);
+    w->older = calloc((size_t)(w->report->columns * w->report->rows), sizeof *w->older);
+    if (status == TL_OK && !w->older)
+        status = tl_fail_memory(error, w->path);
     if (status == TL_OK)
         status = write_index(w, index, error);
     if (status == TL_OK && !w->of->sizes[0])
@@ -404,8 +411,9 @@ static tl_status write_all(writing *w, tl_error *error)
         status = tl_output_commit(index, error);
     else if (index)
         tl_output_abort(index);
-    if (status != TL_OK)
+    if (status != TL_OK && w->older)
         take_back(w);
+    free(w->older);
     free(beside);
     return status;
 }
@@ -418,7 +426,13 @@ tl_status tl_write_preset(const tl_source *source, const char *path, const tl_pr
         return TL_ERROR_ARGUMENT;
     const engine *of = &engines[preset - presets];
     tl_preset_report report;
+    const double *t = source->info.georef.transform;
     tl_status status = check_ending(preset, path, error);
+    if (status == TL_OK && (t[2] != 0 || t[4] != 0))
+        status = tl_fail(error, TL_ERROR_ARGUMENT,
+                         "%s: its rows and columns do not run along the axes, which no such program knows; turn it "
+                         "first, as gdalwarp does",
+                         source->info.name);
     if (status == TL_OK)
         status = lay_out(preset, of, &source->info, options->tile, &report, error);
     if (status != TL_OK)
@@ -429,6 +443,10 @@ tl_status tl_write_preset(const tl_source *source, const char *path, const tl_pr
     status = part ? write_all(&w, error) : TL_ERROR_MEMORY;
     tl_source_destroy(part);
     tl_source_destroy(upright);
+    if (t[5] > 0) /* the rows of the source run the other way */
+        report.window.y = source->info.height - report.window.y - report.window.height;
+    if (t[1] < 0)
+        report.window.x = source->info.width - report.window.x - report.window.width;
     if (status == TL_OK && out)
         *out = report;
     return status;

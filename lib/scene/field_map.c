@@ -3,6 +3,7 @@
 #include "dem/crs.h"
 #include "lib/base/error.h"
 #include "lib/base/number.h"
+#include "lib/base/parallel.h"
 #include "lib/base/size.h"
 
 #include <math.h>
@@ -44,6 +45,39 @@ static tl_status lay(const tl_source_info *model, const tl_source_info *map, dou
     return TL_OK;
 }
 
+/* Where the model's corners lie in the map. */
+static void corners_in(const tl_source_info *model, const double to[6], double low[2], double high[2])
+{
+    for (int axis = 0; axis < 2; axis++) {
+        low[axis] = HUGE_VAL, high[axis] = -HUGE_VAL;
+        for (int corner = 0; corner < 4; corner++) {
+            double i = corner & 1 ? (double)(model->width - 1) : 0, j = corner & 2 ? (double)(model->height - 1) : 0;
+            double at = to[3 * axis] + to[3 * axis + 1] * i + to[3 * axis + 2] * j;
+            low[axis] = fmin(low[axis], at), high[axis] = fmax(high[axis], at);
+        }
+    }
+}
+
+/* Refuses maps of another place, and those that are so much finer that what a block sees of them does not fit. */
+static tl_status check_place(const tl_source_info *model, const tl_source_info *map, const double to[6],
+                             const tl_run *run, tl_error *error)
+{
+    enum { BLOCK = 560 }; /* samples of the model that a block of the finest level sees at most, on a side */
+    double low[2], high[2], bytes = sizeof(float) * (double)tl_parallel_workers(run, UINT64_MAX);
+    const int64_t sizes[2] = {map->width, map->height}, whole[2] = {model->width, model->height};
+    corners_in(model, to, low, high);
+    for (int axis = 0; axis < 2; axis++) {
+        bool around = map->wraps && axis == 0;
+        if (!around && (high[axis] < -0.5 || low[axis] > (double)sizes[axis] - 0.5))
+            return tl_fail(error, TL_ERROR_ARGUMENT,
+                           "%s: lies beside %s and tells nothing of it; give a map of its place", map->name,
+                           model->name);
+        double share = whole[axis] > BLOCK ? BLOCK / (double)whole[axis] : 1;
+        bytes *= fmin((double)sizes[axis], (high[axis] - low[axis]) * share + 2);
+    }
+    return tl_run_fits(run, bytes, map->name, "reading it, much finer than the model, as a map", error);
+}
+
 tl_status scene_field_map_open(const tl_source *map, const tl_source_info *model, const scene_field_map_rule *rule,
                                double fallback, const tl_run *run, scene_field_map *out, tl_error *error)
 {
@@ -56,6 +90,8 @@ tl_status scene_field_map_open(const tl_source *map, const tl_source_info *model
     if (!map)
         return TL_OK;
     tl_status status = lay(model, &map->info, out->to, error);
+    if (status == TL_OK)
+        status = check_place(model, &map->info, out->to, run, error);
     tl_range range;
     tl_run quiet = run ? *run : (tl_run){0};
     quiet.progress = NULL;
