@@ -1,5 +1,6 @@
 /* The field and noise as sources: tiles equal the whole, levels nest, samples are kept, voids stay, places are right.
  */
+#include "dem/crs.h"
 #include "fbm/estimate.h"
 #include "lib/base/georef.h"
 #include "lib/base/size.h"
@@ -939,9 +940,69 @@ static void northUpTurnsRowsAndColumns(void **state)
         }
 }
 
+/* The field over level ground. */
+static float *level_field(const tl_source_info *info, size_t *count)
+{
+    static float flat[40 * 60];
+    tl_field_options options = {
+        .levels = 2, .hurst_given = true, .hurst = 0.7, .delta_given = true, .delta = 1, .support = TL_SUPPORT_POINT};
+    tl_error error;
+    tl_source *source = tl_array_source_create(flat, info, NULL);
+    tl_source *field = tl_field_create(source, &options, &error);
+    if (!field)
+        fail_msg("%s", error.text);
+    *count = (size_t)(field->info.width * field->info.height);
+    float *out = malloc(*count * sizeof *out);
+    tl_window whole = {0, 0, field->info.width, field->info.height};
+    assert_int_equal(tl_source_read(field, 2, whole, out, &error), TL_OK);
+    tl_source_destroy(field);
+    tl_source_destroy(source);
+    return out;
+}
+
+/* Cells of a small geographic raster are nearly alike, so its field is that of a flat raster of such cells: where rows
+ * are halved once (at 50 degrees) and twice (at 71), too. */
+static void narrowingCellsAreAsThoseOfOneShape(void **state)
+{
+    (void)state;
+    tl_crs *crs = NULL;
+    assert_int_equal(dem_crs_from_text("EPSG:4326", "test", &crs, NULL), TL_OK);
+    static const double latitudes[] = {20, 50, 71, -50};
+    for (size_t k = 0; k < sizeof latitudes / sizeof *latitudes; k++) {
+        size_t count, other;
+        double step = 1.0 / 1200;
+        tl_source_info info = {.width = 40, .height = 60, .type = TL_RASTER_POINT, .name = "round"};
+        info.georef = (tl_georef){.crs = crs,
+                                  .located = true,
+                                  .transform = {7, step, 0, latitudes[k] + 30 * step, 0, -step},
+                                  .height_unit = 1};
+        assert_int_equal(dem_georef_measure(&info.georef, 40, 60, NULL), TL_OK);
+        float *round = level_field(&info, &count);
+        tl_source_info flat = info;
+        flat.georef = (tl_georef){.transform = {0, 1, 0, 0, 0, -1},
+                                  .cell_x = info.georef.cell_x,
+                                  .cell_y = info.georef.cell_y,
+                                  .height_unit = 1};
+        float *plain = level_field(&flat, &other);
+        assert_int_equal(count, other);
+        double squares = 0, apart = 0;
+        for (size_t n = 0; n < count; n++) {
+            squares += (double)plain[n] * (double)plain[n];
+            apart += ((double)plain[n] - (double)round[n]) * ((double)plain[n] - (double)round[n]);
+        }
+        assert_true(squares > 0.02 * (double)count);
+        if (!(apart < 1e-4 * squares)) /* a hundredth: the aspect changes by 2 parts in 1000 over the raster */
+            fail_msg("at %g degrees the field is %g of itself off", latitudes[k], sqrt(apart / squares));
+        free(round);
+        free(plain);
+    }
+    tl_crs_release(crs);
+}
+
 int main(void)
 {
     const struct CMUnitTest tests[] = {
+        cmocka_unit_test(narrowingCellsAreAsThoseOfOneShape),
         cmocka_unit_test(fieldWindowsEqualTheWhole),
         cmocka_unit_test(finePointLevelsContainTheCoarse),
         cmocka_unit_test(footprintAndPositionsAreKept),

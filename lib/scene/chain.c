@@ -276,10 +276,11 @@ static fbm_row_step row_step_by(work *w, int stage, const fbm_row_table *table)
         return step;
     }
     fbm_row_weights *rows = w->rows;
+    double before = stage - c->shape.halvings; /* aspects are those after all halvings */
     step.first_row = w->windows[stage].j;
     for (size_t k = 0; k < w->windows[stage].height; k++) {
         double place = (double)(2 * (step.first_row + (int64_t)k) + 1) * half_row(stage);
-        fbm_row_table_at(table, log_aspect(&c->shape, place), &rows[k]);
+        fbm_row_table_at(table, log_aspect(&c->shape, place) + before, &rows[k]);
     }
     step.rows = rows;
     return step;
