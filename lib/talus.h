@@ -757,7 +757,7 @@ typedef struct tl_lod_options {
     int max_level; /* finest level that may be used; 0: the field's own. Negative ones are coarser than the DEM */
     bool max_level_given;
     unsigned keep;     /* an or of tl_culling: rules that are switched off */
-    const tl_run *run; /* its memory bounds the tiles that are kept */
+    const tl_run *run; /* its memory bounds what the choice keeps, beside the mesh */
 } tl_lod_options;
 
 typedef struct tl_lod_stats {

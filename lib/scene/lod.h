@@ -113,6 +113,9 @@ static inline lod_vertex *lod_at(const lod *l, uint32_t vertex)
 
 /* ---- lod.c: the world of a selection ---- */
 
+/* Whether tiles, vertices and `others` bytes are within the run's memory. */
+tl_status lod_fits(const lod *l, size_t others, tl_error *error);
+
 tl_status lod_init(lod *l, const tl_source *field, const tl_source *dem, const tl_pyramid *pyramid,
                    const tl_lod_options *options, tl_error *error);
 void lod_finish(lod *l);

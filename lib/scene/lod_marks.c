@@ -22,6 +22,14 @@ bool lod_list_grow(lod_list *list, size_t more, size_t size)
     return true;
 }
 
+tl_status lod_fits(const lod *l, size_t others, tl_error *error)
+{
+    size_t bytes = scene_tiles_bytes(l->tiles) + l->vertices.room * sizeof(lod_vertex) +
+                   l->asked.room * sizeof(lod_request) + others;
+    return tl_run_fits(l->run, (double)bytes, l->dem->info.name, "its view, which a larger pixel error makes smaller,",
+                       error);
+}
+
 int lod_depth_of(const lod *l, int32_t x, int32_t y)
 {
     int stage = __builtin_ctz((uint32_t)(x | y));

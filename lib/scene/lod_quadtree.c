@@ -241,6 +241,11 @@ static tl_status one_depth(search *self, tl_error *error)
 {
     lod *l = self->l;
     tl_status status = tl_run_check(l->run, error);
+    if (status == TL_OK)
+        status = lod_fits(l,
+                          (self->current.room + self->next.room) * sizeof(lod_triangle) +
+                              self->leaves->room * sizeof(lod_leaf) + self->verdicts.room * sizeof(lod_verdict),
+                          error);
     if (status == TL_OK && self->depth == lod_block_depth(l))
         status = enter_blocks(self, error);
     if (status == TL_OK)

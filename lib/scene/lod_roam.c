@@ -481,6 +481,8 @@ static tl_status place_middles(tl_roam *r, tl_error *error)
 static tl_status split_batch(tl_roam *r, tl_error *error)
 {
     tl_status status = tl_run_check(r->l.run, error);
+    if (status == TL_OK)
+        status = lod_fits(&r->l, r->nodes.room * sizeof(node) + r->leaves.room * sizeof(lod_leaf), error);
     for (size_t k = 0; k < r->queue.count && status == TL_OK; k++) {
         int32_t x, y;
         lod_middle(&r->l, &node_at(r, numbers(&r->queue)[k])->triangle, &x, &y);

@@ -261,7 +261,7 @@ static bool grow(void **items, size_t count, size_t *room, size_t size)
     return true;
 }
 
-static size_t bytes_used(const scene_tiles *t)
+size_t scene_tiles_bytes(const scene_tiles *t)
 {
     return t->tiles.count * sizeof(scene_tile) + t->block_count * sizeof(scene_block);
 }
@@ -573,7 +573,7 @@ static tl_status make_item(void *context, tl_parallel *loop, uint64_t item, unsi
 /* Drops tiles without marks that were not wanted since the last time. */
 static tl_status make_room(scene_tiles *t, tl_error *error)
 {
-    if (!t->memory || bytes_used(t) <= t->memory)
+    if (!t->memory || scene_tiles_bytes(t) <= t->memory)
         return TL_OK;
     table left = {calloc(t->tiles.room, sizeof(void *)), t->tiles.room, 0};
     if (!left.items)
@@ -587,12 +587,12 @@ static tl_status make_room(scene_tiles *t, tl_error *error)
     }
     free(t->tiles.items);
     t->tiles = left;
-    if (bytes_used(t) <= t->memory)
+    if (scene_tiles_bytes(t) <= t->memory)
         return TL_OK;
     return tl_fail(error, TL_ERROR_MEMORY,
                    "%s: the tiles that this view needs take %.0f MB, and %.0f may be used; allow more memory, or a "
                    "larger pixel error",
-                   t->dem->info.name, ceil((double)bytes_used(t) * 1e-6), floor((double)t->memory * 1e-6));
+                   t->dem->info.name, ceil((double)scene_tiles_bytes(t) * 1e-6), floor((double)t->memory * 1e-6));
 }
 
 static void count_wanted(scene_tiles *t)

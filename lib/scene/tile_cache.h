@@ -76,6 +76,8 @@ tl_status scene_tiles_want_block(scene_tiles *tiles, int64_t i, int64_t j, uint3
 /* What is known of the square of 2^log cells that cell (i, j) lies in, log 0 ... 6. */
 void scene_block_at(const scene_tiles *tiles, uint32_t block, int64_t i, int64_t j, int log, scene_cells *out);
 
+/* What tiles and blocks take by now. */
+size_t scene_tiles_bytes(const scene_tiles *tiles);
 scene_tile_counts scene_tiles_counts(const scene_tiles *tiles);
 /* Starts counting again: what has been read before counts for nothing then. */
 void scene_tiles_count_again(scene_tiles *tiles);
