@@ -241,7 +241,7 @@ static tl_status select_by_budget(lod *l, lod_list *leaves, tl_error *error)
 {
     trial self = {l, leaves};
     int at = LOD_BUDGET_START;
-    return lod_search_budget(l, l->pixel_error, STEPS, &at, try_error, &self, error);
+    return lod_search_budget(l, l->pixel_error, LOD_BUDGET_STEP, &at, try_error, &self, error);
 }
 
 tl_status lod_describe(const lod *l, const tl_view *view, tl_mesh *mesh, tl_error *error)

@@ -207,12 +207,12 @@ tl_status lod_count(lod *l, const lod_leaf *leaves, size_t count, uint64_t *tria
 
 /* ---- Budgets ---- */
 
-/* Tries pixel errors of a fixed sequence, 2^(k / 64) and the one that was asked for, for the smallest that stays within
- * the budget, so that it does not depend on where the search begins. `try` sets *fits; the last try is the result. */
+/* Tries pixel errors of a fixed sequence, 2^(k / 64) and the one that was asked for, for a small one that stays within
+ * the budget, where the next smaller one does not. `try` sets *fits; the last try is the result. */
 typedef tl_status lod_try(void *context, double pixel_error, bool *fits, tl_error *error);
 tl_status lod_search_budget(const lod *l, double least, int step, int *at, lod_try *try, void *context,
                             tl_error *error);
-enum { LOD_BUDGET_START = 64 * 4 };
+enum { LOD_BUDGET_START = 64 * 4, LOD_BUDGET_STEP = 64 };
 double lod_now(void); /* seconds */
 void lod_fill_stats(const lod *l, tl_lod_stats *out);
 tl_status lod_describe(const lod *l, const tl_view *view, tl_mesh *mesh, tl_error *error);

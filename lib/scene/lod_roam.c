@@ -53,7 +53,6 @@ struct tl_roam {
     tl_view view;            /* the last one */
     scene_camera camera;
     double references[REFERENCES][3];
-    int budget_at; /* where the last search ended */
     uint64_t split, merged;
 };
 
@@ -726,8 +725,11 @@ static tl_status update(tl_roam *r, tl_error *error)
         status = test_nodes(r, &r->stale, error);
     if (status != TL_OK)
         return status;
-    if (r->options.budget)
-        return lod_search_budget(&r->l, r->options.pixel_error, first ? 64 : 1, &r->budget_at, try_error, r, error);
+    if (r->options.budget) { /* from the same place in every view: where more is hidden of a finer surface, it may have
+                                fewer triangles, and then the search's end depends on its way */
+        int at = LOD_BUDGET_START;
+        return lod_search_budget(&r->l, r->options.pixel_error, LOD_BUDGET_STEP, &at, try_error, r, error);
+    }
     status = merge_all(r, &r->stale, error);
     return status == TL_OK ? split_all(r, &r->stale, error) : status;
 }
@@ -846,7 +848,6 @@ tl_roam *tl_roam_create(const tl_source *field, const tl_source *dem, const tl_p
         r->run = *r->options.run;
     r->options.run = &r->run;
     r->options.selector = TL_SELECTOR_ROAM;
-    r->budget_at = LOD_BUDGET_START;
     if (lod_init(&r->l, field, dem, pyramid, &r->options, error) == TL_OK)
         return r;
     tl_roam_destroy(r);
