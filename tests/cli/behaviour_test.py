@@ -13,6 +13,7 @@ import re
 import resource
 import select
 import signal
+import struct
 import subprocess
 import sys
 import time
