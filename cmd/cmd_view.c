@@ -6,6 +6,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <strings.h>
 #include <sys/stat.h>
 
 typedef struct settings {
@@ -14,7 +15,7 @@ typedef struct settings {
     lod_options lod;
     picture_options picture;
     int frame;
-    bool json, measure;
+    bool json, measure, morph;
 } settings;
 
 /* What the command is about, in messages. */
@@ -27,10 +28,10 @@ static void report(const settings *set, const tl_lod_stats *s, double seconds)
 {
     command_say(&set->common,
                 "%s: %llu triangles, %llu vertices, finest level %d, error <= %.3g pixels; %llu tiles of %llu samples "
-                "made, %llu blocks of the DEM read; %.2f s, of which %.2f s for the view",
+                "made, %llu blocks of the DEM read; chosen in %.2f s, written in %.2f s",
                 name_of(set), (unsigned long long)s->triangles, (unsigned long long)s->vertices, s->finest_level,
                 s->pixel_error, (unsigned long long)s->tiles_made, (unsigned long long)s->samples_made,
-                (unsigned long long)s->dem_blocks, seconds, s->seconds);
+                (unsigned long long)s->dem_blocks, s->seconds, seconds);
     command_say(&set->common,
                 "left out: %llu nodes beside the screen, %llu that look away, %llu behind the horizon, %llu behind "
                 "ridges",
@@ -53,7 +54,8 @@ static int print_json(const tl_lod_stats *stats, const tl_view_report *measured)
 static tl_status write_outputs(const settings *set, const tl_mesh *mesh, const tl_source *dem, const tl_view *view,
                                const tl_run *run, tl_error *error)
 {
-    const tl_write_options writing = {.overwrite = set->common.overwrite, .frame = (tl_frame)set->frame, .run = run};
+    const tl_write_options writing = {
+        .overwrite = set->common.overwrite, .frame = (tl_frame)set->frame, .parent_heights = set->morph, .run = run};
     tl_view_picture_options look = set->picture.look;
     look.overwrite = set->common.overwrite;
     look.run = run;
@@ -136,6 +138,15 @@ static int view(settings *set, const arguments *inputs)
     return status;
 }
 
+static bool morph_ok(const settings *set)
+{
+    const char *dot = set->common.output ? strrchr(set->common.output, '.') : NULL;
+    if (!set->morph || (dot && strcasecmp(dot, ".glb") == 0))
+        return true;
+    complain("--morph is for a .glb; name one behind -o");
+    return false;
+}
+
 static int run(const command *self, int argc, const char **argv, bool help)
 {
     settings set = {.lod = {.levels = 6}};
@@ -150,6 +161,10 @@ static int run(const command *self, int argc, const char **argv, bool help)
     const option output[] = {COMMON_OUTPUT(set.common),
                              {"frame", 0, OPTION_CHOICE, &set.frame, NULL, "FRAME",
                               "coordinates of the mesh (default: enu where the CRS is known)", 0, 0, frame_names},
+                             {"morph", 0, OPTION_FLAG, &set.morph, NULL, NULL,
+                              "in a .glb, with the surface before each vertex came: a morph target, and the attribute "
+                              "_PARENT_HEIGHT",
+                              0, 0, NULL},
                              {"json", 0, OPTION_FLAG, &set.json, NULL, NULL, "print statistics as JSON", 0, 0, NULL},
                              {0}};
     const option running[] = {COMMON_RUNNING(set.common), {0}};
@@ -161,7 +176,7 @@ static int run(const command *self, int argc, const char **argv, bool help)
         return status;
     bool mesh = set.common.output || !(set.picture.picture || set.measure);
     bool good = view_options_ok(&set.view) && lod_options_ok(&set.lod) && picture_options_ok(&set.picture) &&
-                (!mesh || command_output_ok(&set.common, false, true));
+                (!mesh || command_output_ok(&set.common, false, true)) && morph_ok(&set);
     status = good ? view(&set, &rest) : EXIT_USAGE;
     arguments_free(&rest);
     return status;

@@ -996,6 +996,9 @@ typedef struct tl_write_options {
                    grid */
     tl_frame frame;
     tl_mesh_coding coding; /* of meshes in GLB; others keep theirs */
+    /* GLB, of meshes that tl_mesh_parent_heights knows: also write these, as the attribute _PARENT_HEIGHT, and the ways
+     * there as a morph target, "parent". */
+    bool parent_heights;
     const tl_run *run;
 } tl_write_options;
 

@@ -44,7 +44,12 @@ typedef struct view {
     int target;
 } view;
 
-enum { VIEWS = 3 };
+/* How a vertex moves to where the surface was before it came, and its height there. */
+typedef struct morph {
+    float by[3], height;
+} morph;
+
+enum { VIEWS = 4 };
 
 typedef struct model {
     tl_mesh_coding coding;
@@ -53,6 +58,7 @@ typedef struct model {
     view views[VIEWS];
     int view_count;
     vertex *vertices;
+    morph *morphs; /* NULL: not asked for */
     size_t vertex_count;
     uint32_t *indices;
     size_t index_count;
@@ -132,14 +138,66 @@ static void add_normals(model *m)
     }
 }
 
-static tl_status build(const tl_mesh *mesh, out_frame *frame, model *m, const char *path, tl_error *error)
+/* Fills m->morphs, of vertices in the mesh's order. */
+static tl_status place_morphs(const tl_mesh *mesh, out_frame *frame, const vertex *placed, model *m, tl_error *error)
+{
+    float *heights = tl_alloc(mesh->vertex_count, sizeof *heights);
+    tl_status status = heights ? tl_mesh_parent_heights(mesh, heights, error) : tl_fail_memory(error, "the mesh");
+    for (size_t k = 0; k < mesh->vertex_count && status == TL_OK; k += BATCH) {
+        tl_vertex moved[BATCH];
+        double xyz[BATCH][3], at[3];
+        size_t n = mesh->vertex_count - k < BATCH ? mesh->vertex_count - k : BATCH;
+        for (size_t i = 0; i < n; i++) {
+            moved[i] = mesh->vertices[k + i];
+            moved[i].z = heights[k + i];
+        }
+        status = out_frame_apply(frame, moved, n, xyz, error);
+        for (size_t i = 0; i < n && status == TL_OK; i++) {
+            to_gltf(xyz[i], at);
+            m->morphs[k + i].height = heights[k + i];
+            for (int a = 0; a < 3; a++)
+                m->morphs[k + i].by[a] = (float)(at[a] - m->origin[a] - (double)placed[k + i].position[a]);
+        }
+    }
+    free(heights);
+    return status;
+}
+
+/* Vertices in the order in which triangles ask for them; m->vertices has room for all. */
+static tl_status order_vertices(model *m, const vertex *placed, const char *path, tl_error *error)
+{
+    if (!m->morphs) {
+        m->vertex_count = meshopt_optimizeVertexFetch(m->vertices, m->indices, m->index_count, placed, m->vertex_count,
+                                                      sizeof *placed);
+        return TL_OK;
+    }
+    size_t count = m->vertex_count;
+    uint32_t *remap = tl_alloc(count, sizeof *remap);
+    morph *ordered = tl_alloc(count, sizeof *ordered);
+    if (!remap || !ordered) {
+        free(remap);
+        free(ordered);
+        return tl_fail_memory(error, path);
+    }
+    m->vertex_count = meshopt_optimizeVertexFetchRemap(remap, m->indices, m->index_count, count);
+    meshopt_remapVertexBuffer(m->vertices, placed, count, sizeof *placed, remap);
+    meshopt_remapVertexBuffer(ordered, m->morphs, count, sizeof *ordered, remap);
+    meshopt_remapIndexBuffer(m->indices, m->indices, m->index_count, remap);
+    free(remap);
+    free(m->morphs);
+    m->morphs = ordered;
+    return TL_OK;
+}
+
+static tl_status build(const tl_mesh *mesh, out_frame *frame, model *m, bool morphs, const char *path, tl_error *error)
 {
     m->vertex_count = mesh->vertex_count;
     m->index_count = 3 * mesh->triangle_count;
     vertex *placed = tl_alloc(m->vertex_count, sizeof *placed);
     m->vertices = tl_alloc(m->vertex_count, sizeof *m->vertices);
     m->indices = tl_alloc(m->index_count, sizeof *m->indices);
-    if (!placed || !m->vertices || !m->indices) {
+    m->morphs = morphs ? tl_alloc(m->vertex_count, sizeof *m->morphs) : NULL;
+    if (!placed || !m->vertices || !m->indices || (morphs && !m->morphs)) {
         free(placed);
         return tl_fail_memory(error, path);
     }
@@ -156,10 +214,11 @@ static tl_status build(const tl_mesh *mesh, out_frame *frame, model *m, const ch
     tl_status status = place_vertices(mesh, frame, m, error);
     if (status == TL_OK)
         add_normals(m);
+    if (status == TL_OK && morphs)
+        status = place_morphs(mesh, frame, placed, m, error);
     m->vertices = ordered;
     if (status == TL_OK)
-        m->vertex_count =
-            meshopt_optimizeVertexFetch(ordered, m->indices, m->index_count, placed, m->vertex_count, sizeof *placed);
+        status = order_vertices(m, placed, path, error);
     free(placed);
     return status;
 }
@@ -257,6 +316,14 @@ static bool encode(view *v, size_t vertex_count)
     return v->size > 0;
 }
 
+static bool add_morphs(model *m)
+{
+    view *v = add_view(m, m->vertex_count, sizeof *m->morphs, ARRAY_BUFFER, NULL);
+    if (v)
+        memcpy(v->bytes, m->morphs, v->size);
+    return v;
+}
+
 static tl_status make_views(model *m, const char *path, tl_error *error)
 {
     bool good = true;
@@ -271,7 +338,7 @@ static tl_status make_views(model *m, const char *path, tl_error *error)
     }
     free(m->vertices); /* the largest of all, and done with */
     m->vertices = NULL;
-    good = good && add_indices(m);
+    good = good && (!m->morphs || add_morphs(m)) && add_indices(m);
     if (m->coding == TL_CODING_COMPRESSED) {
         meshopt_encodeVertexVersion(0); /* those of the extension */
         meshopt_encodeIndexVersion(1);
@@ -286,6 +353,7 @@ static void free_model(model *m)
     for (int k = 0; k < m->view_count; k++)
         free(m->views[k].bytes);
     free(m->vertices);
+    free(m->morphs);
     free(m->indices);
 }
 
@@ -338,6 +406,21 @@ static void add_bounds(const model *m, json_t *position)
                         whole ? json_pack("[i,i,i]", (int)high[0], (int)high[1], (int)high[2]) : triple(high));
 }
 
+/* The same of the ways that vertices move. */
+static void add_range(const model *m, json_t *by)
+{
+    double low[3], high[3];
+    for (int a = 0; a < 3; a++) {
+        low[a] = HUGE_VAL, high[a] = -HUGE_VAL;
+        for (size_t k = 0; k < m->vertex_count; k++) {
+            low[a] = fmin(low[a], (double)m->morphs[k].by[a]);
+            high[a] = fmax(high[a], (double)m->morphs[k].by[a]);
+        }
+    }
+    json_object_set_new(by, "min", triple(low));
+    json_object_set_new(by, "max", triple(high));
+}
+
 static json_t *accessors(const model *m)
 {
     bool plain = m->coding == TL_CODING_PLAIN;
@@ -348,7 +431,16 @@ static json_t *accessors(const model *m)
     if (!plain)
         json_object_set_new(normal, "normalized", json_true());
     int component = small_indices(m) ? COMPONENT_U16 : COMPONENT_U32;
-    return json_pack("[o,o,o]", position, normal, accessor(m->view_count - 1, 0, component, m->index_count, "SCALAR"));
+    json_t *list =
+        json_pack("[o,o,o]", position, normal, accessor(m->view_count - 1, 0, component, m->index_count, "SCALAR"));
+    if (m->morphs) {
+        int part = m->view_count - 2;
+        json_t *by = accessor(part, 0, COMPONENT_FLOAT, m->vertex_count, "VEC3");
+        add_range(m, by);
+        json_array_append_new(list, by);
+        json_array_append_new(list, accessor(part, 12, COMPONENT_FLOAT, m->vertex_count, "SCALAR"));
+    }
+    return list;
 }
 
 static size_t padded(size_t bytes)
@@ -416,6 +508,17 @@ static json_t *describe_node(const model *m)
     return node;
 }
 
+/* The surface before the vertices came, at weight 1. */
+static void add_target(json_t *root)
+{
+    json_t *mesh = json_array_get(json_object_get(root, "meshes"), 0);
+    json_t *primitive = json_array_get(json_object_get(mesh, "primitives"), 0);
+    json_object_set_new(primitive, "targets", json_pack("[{s:i}]", "POSITION", 3));
+    json_object_set_new(json_object_get(primitive, "attributes"), "_PARENT_HEIGHT", json_integer(4));
+    json_object_set_new(mesh, "weights", json_pack("[f]", 0.0));
+    json_object_set_new(mesh, "extras", json_pack("{s:[s]}", "targetNames", "parent"));
+}
+
 static char *describe(const tl_mesh *mesh, const out_frame *frame, const model *m)
 {
     json_t *root =
@@ -427,6 +530,8 @@ static char *describe(const tl_mesh *mesh, const out_frame *frame, const model *
                   "baseColorFactor", 0.55, 0.52, 0.46, 1.0, "metallicFactor", 0.0, "roughnessFactor", 1.0);
     if (root)
         add_geometry(m, root);
+    if (root && m->morphs)
+        add_target(root);
     char *text = root ? json_dumps(root, JSON_COMPACT | JSON_REAL_PRECISION(17)) : NULL;
     json_decref(root);
     return text;
@@ -480,6 +585,9 @@ tl_status out_gltf_write(const tl_mesh *mesh, tl_output *output, const tl_write_
     if (options->coding != TL_CODING_COMPRESSED &&
         (double)mesh->vertex_count * least + (double)mesh->triangle_count * 6 > UINT32_MAX)
         return too_large(path, mesh->triangle_count, error);
+    if (options->parent_heights && options->coding != TL_CODING_PLAIN)
+        return tl_fail(error, TL_ERROR_ARGUMENT, "%s: heights of parents are kept as floats; leave the coding away",
+                       path);
     tl_status status = tl_run_check(options->run, error);
     out_frame *frame = status == TL_OK ? out_frame_create(mesh, options->frame, path, error) : NULL;
     if (!frame)
@@ -487,7 +595,7 @@ tl_status out_gltf_write(const tl_mesh *mesh, tl_output *output, const tl_write_
     model m = {.coding = options->coding, .level_steps = out_frame_kind(frame) == TL_FRAME_PIXEL};
     status = first_position(mesh, frame, m.origin, error);
     if (status == TL_OK)
-        status = build(mesh, frame, &m, path, error);
+        status = build(mesh, frame, &m, options->parent_heights, path, error);
     if (status == TL_OK)
         status = make_views(&m, path, error);
     char *json = status == TL_OK ? describe(mesh, frame, &m) : NULL;

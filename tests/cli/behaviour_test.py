@@ -792,6 +792,34 @@ def layers_are_written_beside(case):
     expect(not os.path.exists(case.path("v.exr")), "work was done")
 
 
+def vertices_tell_where_they_came_from(case):
+    """With --morph the attribute is the height plus the way of the morph target upwards; some move, by no more than the relief."""
+    case.run("view", EXAMPLE, "--eye", "-84.25,36.55,300", "--above-ground", "--heading", 120, "-l", 1, "--frame", "pixel",
+             "--morph", "-q", "-o", "m.glb")
+    with open(case.path("m.glb"), "rb") as file:
+        data = file.read()
+    size = struct.unpack_from("<I", data, 12)[0]
+    about, binary = json.loads(data[20:20 + size]), data[28 + size:]
+    primitive = about["meshes"][0]["primitives"][0]
+
+    def values(index, width):
+        a = about["accessors"][index]
+        v = about["bufferViews"][a["bufferView"]]
+        start = v.get("byteOffset", 0) + a.get("byteOffset", 0)
+        return [struct.unpack_from(f"<{width}f", binary, start + k * v["byteStride"]) for k in range(a["count"])]
+
+    at, by = values(primitive["attributes"]["POSITION"], 3), values(primitive["targets"][0]["POSITION"], 3)
+    parent = values(primitive["attributes"]["_PARENT_HEIGHT"], 1)
+    expect(len(at) == len(by) == len(parent) > 1000, f"{len(at)} {len(by)} {len(parent)}")
+    moved = 0
+    for position, way, height in zip(at, by, parent):
+        expect(abs(position[1] + way[1] - height[0]) < 1e-3 and way[0] == way[2] == 0, f"{position} {way} {height}")
+        moved += way[1] != 0
+    expect(moved > len(at) / 2 and max(abs(way[1]) for way in by) < 900, f"{moved} of {len(at)} move")
+    refused = case.run("view", EXAMPLE, "--eye", "-84.25,36.55,300", "--morph", "-o", "m.ply", status=2).err
+    expect("--morph is for a .glb" in refused, refused)
+
+
 # ---- the manuals ----
 
 def commands_in_readme():
@@ -986,7 +1014,7 @@ TESTS = [
     names_of_any_bytes,
     formats_hold_the_same_heights, png_within_half_a_step, point_samples_are_kept, point_samples_of_the_andes_are_kept,
     area_means_stay_on_their_footprint,
-    glb_is_in_metres, frames_agree, simplify_keeps_its_word, diagonals_are_turned, codings_keep_the_bound, layers_are_written_beside,
+    glb_is_in_metres, frames_agree, simplify_keeps_its_word, diagonals_are_turned, codings_keep_the_bound, layers_are_written_beside, vertices_tell_where_they_came_from,
     manuals_show_what_works, man_page_knows_every_option,
     memory_does_not_grow_with_the_output, memory_stays_within_what_is_given, bad_files_end_with_one_line,
     gdal_reads_the_geotiff, gdal_places_the_example, openexr_reads_the_exr, openimageio_agrees_on_the_range,
