@@ -258,6 +258,8 @@ static int fly(settings *set, const arguments *inputs)
         free(path.views);
         return command_failed(&bar, &error);
     }
+    if (set->shutter > 0 && draws_pictures(set)) /* what one view's ridges hide, the next ones see */
+        set->lod.lod.keep |= TL_CULL_RIDGE | TL_CULL_BACK | TL_CULL_HORIZON;
     int status = start(set, &ground, &path, &run, &bar);
     lod_ground_close(&ground);
     free(path.views);
@@ -267,7 +269,7 @@ static int fly(settings *set, const arguments *inputs)
 static bool settings_ok(settings *set)
 {
     if (!set->view.camera) {
-        complain("a path is wanted: --camera with a file of several views");
+        complain("a path is wanted: --path (or --camera) with a file of several views");
         return false;
     }
     if (!view_options_ok(&set->view) || !lod_options_ok(&set->lod) || !picture_options_ok(&set->picture))

@@ -63,8 +63,8 @@ static int report_check(const settings *set, const tl_mesh_report *check)
     if (!(check->max_error <= set->max_error)) {
         complain(
             "%s: its numbers are %.3g more than %.9g from the DEM at column %lld, row %lld; if they are too coarse "
-            "for that, use .ply with --frame projected or pixel (and no --coding); there it would be a fault of "
-            "talus, please report it",
+            "for that, leave --coding away, or use .ply with --frame projected or pixel; there it would be a fault "
+            "of talus, please report it",
             set->common.output, check->max_error - set->max_error, set->max_error, (long long)check->worst_i,
             (long long)check->worst_j);
         return EXIT_FAILED;

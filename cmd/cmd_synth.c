@@ -131,6 +131,30 @@ static tl_status write_layer(const settings *set, const tl_source *made, const c
     return status;
 }
 
+/* Told before the work: a layer that cannot be, or whose file is there. */
+static tl_status check_layers(const settings *set, const tl_source *made, tl_error *error)
+{
+    const tl_layer_options options = {.rules = set->layer_rules};
+    char *list = set->layers ? strdup(set->layers) : NULL, *rest;
+    tl_status status = TL_OK;
+    for (char *kind = list ? strtok_r(list, ",", &rest) : NULL; kind && status == TL_OK;
+         kind = strtok_r(NULL, ",", &rest)) {
+        char *path = layer_path(set, kind);
+        tl_source *layer = tl_layer_create(made, kind, 0, &options, error);
+        status = layer ? TL_OK : error->status;
+        if (layer && path && !set->common.overwrite && access(path, F_OK) == 0) {
+            *error = (tl_error){.status = TL_ERROR_IO};
+            snprintf(error->text, sizeof error->text, "%.300s: exists already; name another file or give --overwrite",
+                     path);
+            status = TL_ERROR_IO;
+        }
+        tl_source_destroy(layer);
+        free(path);
+    }
+    free(list);
+    return status;
+}
+
 static tl_status write_layers(const settings *set, const tl_source *made, const tl_run *run, progress *bar,
                               tl_error *error)
 {
@@ -150,7 +174,7 @@ static int write_out(const settings *set, const tl_source *made, const tl_run *r
 {
     tl_error error;
     progress_stage(bar, "synthesis");
-    if (write_grid(set, made, run, &error) != TL_OK)
+    if (check_layers(set, made, &error) != TL_OK || write_grid(set, made, run, &error) != TL_OK)
         return command_failed(bar, &error);
     report(set, made, progress_end(bar));
     if (write_layers(set, made, run, bar, &error) != TL_OK)

@@ -39,6 +39,15 @@ static void report(const settings *set, const tl_lod_stats *s, double seconds)
                 (unsigned long long)s->culled[3]);
 }
 
+/* Most likely the eye is elsewhere than was meant. */
+static void warn_of_nothing(const settings *set, const tl_lod_stats *s)
+{
+    if (s->triangles == 0)
+        command_say(&set->common,
+                    "warning: nothing is in sight; does the eye (longitude first, then latitude) stand over the DEM, "
+                    "and look at it?");
+}
+
 static int print_json(const tl_lod_stats *stats, const tl_view_report *measured)
 {
     json_t *root = lod_stats_json(stats);
@@ -108,6 +117,7 @@ static int write_view(const settings *set, const lod_ground *ground, const tl_ru
     if (status != TL_OK)
         return command_failed(bar, &error);
     report(set, &stats, seconds);
+    warn_of_nothing(set, &stats);
     if (set->measure) {
         char text[VIEW_REPORT_TEXT];
         view_report_text(&measured, text, sizeof text);

@@ -7,6 +7,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/stat.h>
 
 const char *const progress_names[] = {
     [PROGRESS_BAR] = "bar", [PROGRESS_JSON] = "json", [PROGRESS_NONE] = "none", [PROGRESS_NONE + 1] = NULL};
@@ -138,6 +139,21 @@ static void cut(const common *options, opened_input *opened, tl_error *error)
         put_over(opened, tl_cut_create(opened->source, opened->window, error));
 }
 
+/* Whether an output would take the place of an input. */
+static bool is_input(const common *options, const arguments *inputs, tl_error *error)
+{
+    struct stat output, input;
+    if (!options->output || stat(options->output, &output) != 0)
+        return false;
+    for (size_t k = 0; k < inputs->count; k++)
+        if (stat(inputs->names[k], &input) == 0 && input.st_dev == output.st_dev && input.st_ino == output.st_ino) {
+            *error = (tl_error){.status = TL_ERROR_ARGUMENT};
+            snprintf(error->text, sizeof error->text, "%.300s: is the input too; name another output", options->output);
+            return true;
+        }
+    return false;
+}
+
 opened_input command_open(const common *options, const arguments *inputs, const tl_run *run, tl_error *error)
 {
     /* opening has no progress to speak of */
@@ -145,6 +161,8 @@ opened_input command_open(const common *options, const arguments *inputs, const 
     const tl_geoid_options geoid = {.grid = options->geoid, .memory = left_bytes(options) / 16};
     tl_void_options voids;
     opened_input opened = {0};
+    if (is_input(options, inputs, error))
+        return opened;
     if (void_options(options, run, &voids, error))
         put_over(&opened, open_files(options, inputs, &quietly, error));
     opened.file = opened.source;

@@ -820,6 +820,29 @@ def vertices_tell_where_they_came_from(case):
     expect("--morph is for a .glb" in refused, refused)
 
 
+def inputs_are_not_overwritten(case):
+    """An output that is an input too, by whatever name, is refused even with --overwrite, and the input stays."""
+    with open(EXAMPLE, "rb") as example, open(case.path("dem.tif"), "wb") as copy:
+        copy.write(example.read())
+    os.symlink("dem.tif", case.path("alias.tif"))
+    before = open(case.path("dem.tif"), "rb").read()
+    for name in ("dem.tif", "./dem.tif", "alias.tif"):
+        said = case.run("synth", "dem.tif", "-l", 0, "-o", name, "--overwrite", status=1).err
+        expect("is the input too" in said, said)
+    expect(open(case.path("dem.tif"), "rb").read() == before, "the input changed")
+
+
+def layers_are_refused_before_the_work(case):
+    """A layer that cannot be, or whose file is there, leaves no heights behind."""
+    said = case.run("synth", EXAMPLE, "-l", 1, "--layers", "slope,sigma", "-o", "t.exr", status=1).err
+    expect("--support point" in said, said)
+    with open(case.path("u.slope.exr"), "w", encoding="utf-8") as file:
+        file.write("mine")
+    said = case.run("synth", EXAMPLE, "-l", 1, "--layers", "slope", "-o", "u.exr", status=1).err
+    expect("u.slope.exr: exists already" in said, said)
+    expect(sorted(os.listdir(case.path("."))) == ["u.slope.exr"], f"{os.listdir(case.path('.'))}")
+
+
 # ---- the manuals ----
 
 def commands_in_readme():
@@ -1014,7 +1037,7 @@ TESTS = [
     names_of_any_bytes,
     formats_hold_the_same_heights, png_within_half_a_step, point_samples_are_kept, point_samples_of_the_andes_are_kept,
     area_means_stay_on_their_footprint,
-    glb_is_in_metres, frames_agree, simplify_keeps_its_word, diagonals_are_turned, codings_keep_the_bound, layers_are_written_beside, vertices_tell_where_they_came_from,
+    glb_is_in_metres, frames_agree, simplify_keeps_its_word, diagonals_are_turned, codings_keep_the_bound, layers_are_written_beside, inputs_are_not_overwritten, layers_are_refused_before_the_work, vertices_tell_where_they_came_from,
     manuals_show_what_works, man_page_knows_every_option,
     memory_does_not_grow_with_the_output, memory_stays_within_what_is_given, bad_files_end_with_one_line,
     gdal_reads_the_geotiff, gdal_places_the_example, openexr_reads_the_exr, openimageio_agrees_on_the_range,
