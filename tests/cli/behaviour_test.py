@@ -276,14 +276,6 @@ def refuses_to_replace(case):
     expect("a.json: exists already" in result.err, result.err)
 
 
-def input_may_be_the_output(case):
-    """The old file is read to its end before the new one takes its name."""
-    write_dem(case, "dem.tif")
-    case.run("synth", "dem.tif", "-l", 3, "-q", "-o", "other.tif")
-    case.run("synth", "dem.tif", "-l", 3, "-q", "--overwrite", "-o", "dem.tif")
-    expect(sha256(case.path("dem.tif")) == sha256(case.path("other.tif")), "different bytes")
-
-
 def follows_the_umask(case):
     case.run("noise", "--size", 9, "-q", "-o", "a.exr", preexec_fn=lambda: os.umask(0o027))
     expect(os.stat(case.path("a.exr")).st_mode & 0o777 == 0o640, oct(os.stat(case.path("a.exr")).st_mode))
@@ -1030,7 +1022,7 @@ TESTS = [
     leaves_nothing_when_interrupted_early, leaves_nothing_when_interrupted_twice,
     leaves_nothing_or_all_when_a_mesh_is_interrupted, leaves_nothing_when_killed, leaves_the_old_file_when_interrupted,
     tells_a_file_size_limit, tells_a_full_disk, tells_an_unwritable_folder, refuses_to_replace,
-    input_may_be_the_output, follows_the_umask,
+    follows_the_umask,
     tells_a_full_stdout, tells_a_broken_pipe, closed_streams_do_not_go_into_the_output,
     bar_only_on_a_terminal, progress_lines_are_json, quiet_is_silent,
     json_keeps_its_schema, statistics_keep_their_schema, real_files_keep_the_schema, window_costs_its_blocks, a_part_is_that_part, corners_agree_with_gdal,
