@@ -11,12 +11,6 @@ typedef struct settings {
     bool eye_given, target_given, azimuth_given, elevation_given;
 } settings;
 
-static bool ends_with_png(const char *path)
-{
-    size_t length = strlen(path);
-    return length > 4 && (strcmp(path + length - 4, ".png") == 0 || strcmp(path + length - 4, ".PNG") == 0);
-}
-
 /* What is not given is the library's choice for the kind of picture. */
 static void place_sun(settings *set)
 {
@@ -29,7 +23,7 @@ static void place_sun(settings *set)
 
 static bool settings_ok(settings *set)
 {
-    if (!set->common.output || !ends_with_png(set->common.output)) {
+    if (!command_ends_with(set->common.output, ".png")) {
         complain("a name that ends with .png is wanted behind -o");
         return false;
     }

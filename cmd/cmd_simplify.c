@@ -4,7 +4,6 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
-#include <strings.h>
 #include <sys/stat.h>
 #include <unistd.h>
 
@@ -403,24 +402,11 @@ static bool read_share(settings *set)
     return false;
 }
 
-static bool is_tiff(const char *path)
-{
-    const char *dot = path ? strrchr(path, '.') : NULL;
-    return dot && (strcasecmp(dot, ".tif") == 0 || strcasecmp(dot, ".tiff") == 0);
-}
-
-static bool is_glb(const char *path)
-{
-    const char *dot = path ? strrchr(path, '.') : NULL;
-    return dot && strcasecmp(dot, ".glb") == 0;
-}
-
 static bool points_output_ok(const settings *set)
 {
     static const char *const endings[] = {".geojson", ".json", ".csv", ".ply", ".tif", ".tiff"};
-    const char *dot = set->common.output ? strrchr(set->common.output, '.') : NULL;
-    for (size_t k = 0; dot && k < sizeof endings / sizeof *endings; k++)
-        if (strcasecmp(dot, endings[k]) == 0)
+    for (size_t k = 0; k < sizeof endings / sizeof *endings; k++)
+        if (command_ends_with(set->common.output, endings[k]))
             return true;
     complain("%s; points are written to .geojson, .csv, .ply or .tif",
              set->common.output ? set->common.output : "no output named; give -o FILE");
@@ -448,13 +434,14 @@ static bool settings_ok(settings *set)
     else if (set->diagonal != DIAGONAL_LONGEST_EDGE && (set->points || set->mesh != TL_MESH_QUADTREE || set->error_map))
         complain("--diagonal lower is for quadtree meshes under one bound; leave --mesh, --points and --max-error-map "
                  "away");
-    else if (set->coding != TL_CODING_PLAIN && !is_glb(set->common.output))
+    else if (set->coding != TL_CODING_PLAIN && !command_ends_with(set->common.output, ".glb"))
         complain("--coding is for .glb; other formats have but one");
     else if (set->features && !set->max_error_given)
         complain("--features needs --max-error E, which tells what matters");
     else if (set->points && (set->skirt > 0 || set->base > 0))
         complain("--points have no --skirt and no --base");
-    else if (set->points && set->verify && !is_tiff(set->common.output))
+    else if (set->points && set->verify && !command_ends_with(set->common.output, ".tif") &&
+             !command_ends_with(set->common.output, ".tiff"))
         complain("--verify measures a surface; of --points only .tif has one");
     else
         return true;

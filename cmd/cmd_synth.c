@@ -206,7 +206,7 @@ static bool layers_ok(const settings *set)
     return good;
 }
 
-static bool mip_ok(const settings *set)
+static bool grid_output_ok(const settings *set)
 {
     if (!layers_ok(set))
         return false;
@@ -335,8 +335,9 @@ static int verify(const settings *set, const ground *of, const tl_source *field,
     tl_error error;
     double inside = 0, outside = 0;
     progress_stage(bar, "verifying");
-    const char *dot = strrchr(set->common.output, '.');
-    bool grid = dot && (strcasecmp(dot, ".exr") == 0 || strcasecmp(dot, ".tif") == 0 || strcasecmp(dot, ".tiff") == 0);
+    const char *output = set->common.output;
+    bool grid =
+        command_ends_with(output, ".exr") || command_ends_with(output, ".tif") || command_ends_with(output, ".tiff");
     bool points = field->info.type == TL_RASTER_POINT || set->levels == 0;
     tl_source *file = grid && points ? tl_open(set->common.output, &error) : NULL;
     tl_status status = grid && points && !file ? TL_ERROR_IO : compare(of->dem, field, 0, 1, false, &inside, &error);
@@ -453,6 +454,62 @@ static void list_schemes(bool noise)
         printf("  %-22s  %s\n", schemes[i].name, schemes[i].summary);
 }
 
+/* What synth and noise write, and how. */
+#define GRID_OUTPUT(s)                                                                                                \
+    COMMON_OUTPUT((s).common),                                                                                        \
+        {"compression", 0, OPTION_CHOICE, &(s).compression, NULL, "KIND", "of .exr and .tif (default: zip)", 0, 0,    \
+         compressions},                                                                                               \
+        {"height-quantum",                                                                                            \
+         0,                                                                                                           \
+         OPTION_NUMBER,                                                                                               \
+         &(s).quantum,                                                                                                \
+         &(s).quantum_given,                                                                                          \
+         "Q",                                                                                                         \
+         "round heights to multiples of Q, in the DEM's unit, 1e-30...1e30: smaller files (default: as they are)",    \
+         1e-30,                                                                                                       \
+         1e30,                                                                                                        \
+         NULL},                                                                                                       \
+        {"preset",                                                                                                    \
+         0,                                                                                                           \
+         OPTION_TEXT,                                                                                                 \
+         &(s).preset,                                                                                                 \
+         NULL,                                                                                                        \
+         "PROGRAM",                                                                                                   \
+         "write for unreal, unity, godot, blender or houdini: sizes, names and order of rows, and what to type into " \
+         "its importer",                                                                                              \
+         0,                                                                                                           \
+         0,                                                                                                           \
+         NULL},                                                                                                       \
+        {"tile",                                                                                                      \
+         0,                                                                                                           \
+         OPTION_INTEGER,                                                                                              \
+         &(s).tile,                                                                                                   \
+         NULL,                                                                                                        \
+         "N",                                                                                                         \
+         "samples on a side of the tiles of a preset (default: chosen)",                                              \
+         1,                                                                                                           \
+         65536,                                                                                                       \
+         NULL},                                                                                                       \
+    {                                                                                                                 \
+        "mip", 0, OPTION_CHOICE, &(s).mip, NULL, "KIND",                                                              \
+            "coarser levels in an .exr, of every second sample or of means (default: none)", 0, 0, mips               \
+    }
+
+static bool synth_ok(const settings *set)
+{
+    bool good = (!set->field.scheme || names_scheme(set->field.scheme, false)) &&
+                command_output_ok(&set->common, true, true) && grid_output_ok(set);
+    if (good && set->delta_map && set->sigma_map) {
+        complain("--delta-map and --sigma-map say the same; give one of them");
+        good = false;
+    }
+    if (good && set->verify && !set->max_error_given) {
+        complain("--verify measures against --max-error E; give that too");
+        good = false;
+    }
+    return good;
+}
+
 static int run_synth(const command *self, int argc, const char **argv, bool help)
 {
     settings set = {.levels = 4};
@@ -485,19 +542,7 @@ static int run_synth(const command *self, int argc, const char **argv, bool help
          "what samples stand for: as the raster says, means over cells, or points (default: raster)", 0, 0, supports},
         {0}};
     const option input[] = {COMMON_INPUT(set.common), {0}};
-    const option output[] = {COMMON_OUTPUT(set.common),
-                             {"compression", 0, OPTION_CHOICE, &set.compression, NULL, "KIND",
-                              "of .exr and .tif (default: zip)", 0, 0, compressions},
-                             {"height-quantum", 0, OPTION_NUMBER, &set.quantum, &set.quantum_given, "Q",
-                              "round heights to multiples of Q, in the DEM's unit, 1e-30...1e30: smaller files "
-                              "(default: as they are)",
-                              1e-30, 1e30, NULL},
-                             {"preset", 0, OPTION_TEXT, &set.preset, NULL, "PROGRAM",
-                              "write for unreal, unity, godot, blender or houdini: sizes, names and order of rows, and "
-                              "what to type into its importer",
-                              0, 0, NULL},
-                             {"tile", 0, OPTION_INTEGER, &set.tile, NULL, "N",
-                              "samples on a side of the tiles of a preset (default: chosen)", 1, 65536, NULL},
+    const option output[] = {GRID_OUTPUT(set),
                              {"layers", 0, OPTION_TEXT, &set.layers, NULL, "KINDS",
                               "write these beside the heights, with commas between: normal, tangent, slope, curvature, "
                               "splat, colour, sigma",
@@ -506,9 +551,6 @@ static int run_synth(const command *self, int argc, const char **argv, bool help
                               "of the layers (default: exr)", 0, 0, layer_formats},
                              {"layer-rules", 0, OPTION_TEXT, &set.layer_rules, NULL, "FILE",
                               "a JSON file that says where splat has rock, scree, soil and snow", 0, 0, NULL},
-                             {"mip", 0, OPTION_CHOICE, &set.mip, NULL, "KIND",
-                              "coarser levels in an .exr, of every second sample or of means (default: none)", 0, 0,
-                              mips},
                              {"frame", 0, OPTION_CHOICE, &set.frame, NULL, "FRAME",
                               "coordinates of a mesh (default: enu where the CRS is known)", 0, 0, frame_names},
                              {0}};
@@ -524,17 +566,7 @@ static int run_synth(const command *self, int argc, const char **argv, bool help
     set.field.levels = (int)set.levels;
     set.field.seed = (uint64_t)set.seed;
     set.field.support = (tl_support)set.support;
-    bool good = (!set.field.scheme || names_scheme(set.field.scheme, false)) &&
-                command_output_ok(&set.common, true, true) && mip_ok(&set);
-    if (good && set.delta_map && set.sigma_map) {
-        complain("--delta-map and --sigma-map say the same; give one of them");
-        good = false;
-    }
-    if (good && set.verify && !set.max_error_given) {
-        complain("--verify measures against --max-error E; give that too");
-        good = false;
-    }
-    status = good ? synth(&set, &rest) : EXIT_USAGE;
+    status = synth_ok(&set) ? synth(&set, &rest) : EXIT_USAGE;
     arguments_free(&rest);
     return status;
 }
@@ -576,23 +608,7 @@ static int run_noise(const command *self, int argc, const char **argv, bool help
         {"aspect", 0, OPTION_NUMBER, &set.noise.aspect, NULL, "R",
          "width of a cell over its height, 0.2...5; delta is then over the height (default: 1)", 0.2, 5, NULL},
         {0}};
-    const option output[] = {COMMON_OUTPUT(set.common),
-                             {"compression", 0, OPTION_CHOICE, &set.compression, NULL, "KIND",
-                              "of .exr and .tif (default: zip)", 0, 0, compressions},
-                             {"height-quantum", 0, OPTION_NUMBER, &set.quantum, &set.quantum_given, "Q",
-                              "round heights to multiples of Q, in the DEM's unit, 1e-30...1e30: smaller files "
-                              "(default: as they are)",
-                              1e-30, 1e30, NULL},
-                             {"preset", 0, OPTION_TEXT, &set.preset, NULL, "PROGRAM",
-                              "write for unreal, unity, godot, blender or houdini: sizes, names and order of rows, and "
-                              "what to type into its importer",
-                              0, 0, NULL},
-                             {"tile", 0, OPTION_INTEGER, &set.tile, NULL, "N",
-                              "samples on a side of the tiles of a preset (default: chosen)", 1, 65536, NULL},
-                             {"mip", 0, OPTION_CHOICE, &set.mip, NULL, "KIND",
-                              "coarser levels in an .exr, of every second sample or of means (default: none)", 0, 0,
-                              mips},
-                             {0}};
+    const option output[] = {GRID_OUTPUT(set), {0}};
     const option running[] = {COMMON_RUNNING(set.common), {0}};
     const option_group groups[] = {{"Surface", surface}, {"Output", output}, {"Running", running}, {0}};
     arguments rest;
@@ -604,7 +620,7 @@ static int run_noise(const command *self, int argc, const char **argv, bool help
     }
     set.noise.seed = (uint64_t)set.seed;
     bool good = (!set.noise.scheme || names_scheme(set.noise.scheme, true)) &&
-                command_output_ok(&set.common, true, true) && mip_ok(&set);
+                command_output_ok(&set.common, true, true) && grid_output_ok(&set);
     status = good ? noise(&set) : EXIT_USAGE;
     arguments_free(&rest);
     return status;

@@ -6,7 +6,6 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
-#include <strings.h>
 #include <sys/stat.h>
 
 typedef struct settings {
@@ -150,8 +149,7 @@ static int view(settings *set, const arguments *inputs)
 
 static bool morph_ok(const settings *set)
 {
-    const char *dot = set->common.output ? strrchr(set->common.output, '.') : NULL;
-    if (!set->morph || (dot && strcasecmp(dot, ".glb") == 0))
+    if (!set->morph || command_ends_with(set->common.output, ".glb"))
         return true;
     complain("--morph is for a .glb; name one behind -o");
     return false;

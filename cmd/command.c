@@ -7,6 +7,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <strings.h>
 #include <sys/stat.h>
 
 const char *const progress_names[] = {
@@ -220,6 +221,12 @@ static void complain_of_ending(const char *path, bool grid, bool mesh)
             separator = ", ";
         }
     fputc('\n', stderr);
+}
+
+bool command_ends_with(const char *path, const char *ending)
+{
+    size_t length = path ? strlen(path) : 0, end = strlen(ending);
+    return length > end && strcasecmp(path + length - end, ending) == 0;
 }
 
 bool command_output_ok(const common *options, bool grid, bool mesh)

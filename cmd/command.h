@@ -170,6 +170,9 @@ int command_failed(progress *bar, const tl_error *error);
 __attribute__((format(printf, 2, 3))) void command_say(const common *options, const char *format, ...);
 /* Flushes stdout; EXIT_DONE, or EXIT_FAILED with a message when it could not be written. */
 int command_done(void);
+/* Whether a name, or NULL, ends like this, in upper or lower case; one that is nothing but the ending does not. */
+bool command_ends_with(const char *path, const char *ending);
+
 /* Whether an output was named and has an ending that talus writes as `grid` or `mesh`; else told. */
 bool command_output_ok(const common *options, bool grid, bool mesh);
 

@@ -1,18 +1,13 @@
 #include "cmd/picture_options.h"
 
+#include "cmd/command.h"
+
 #include <stdio.h>
 #include <string.h>
-#include <strings.h>
-
-static bool ends_with(const char *path, const char *ending)
-{
-    size_t length = strlen(path), end = strlen(ending);
-    return length > end && strcasecmp(path + length - end, ending) == 0;
-}
 
 bool picture_is_png(const char *path)
 {
-    return ends_with(path, ".png");
+    return command_ends_with(path, ".png");
 }
 
 bool picture_options_ok(picture_options *o)
@@ -25,7 +20,7 @@ bool picture_options_ok(picture_options *o)
         complain("--depth-map goes with --picture");
         return false;
     }
-    if (o->look.depth && !ends_with(o->look.depth, ".exr")) {
+    if (o->look.depth && !command_ends_with(o->look.depth, ".exr")) {
         complain("--depth-map: a name that ends with .exr is wanted, not '%s'", o->look.depth);
         return false;
     }

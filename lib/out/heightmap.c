@@ -156,6 +156,22 @@ tl_status out_heightmap_write(const tl_source *source, const out_heightmap *how,
 
 /* ---- sidecar ---- */
 
+void out_json_add_record(json_t *object, const tl_source_info *info)
+{
+    double t[6];
+    out_gdal_transform(info, t);
+    if (info->georef.located)
+        json_object_set_new(object, "geotransform", json_pack("[f,f,f,f,f,f]", t[0], t[1], t[2], t[3], t[4], t[5]));
+    if (info->georef.crs) {
+        json_object_set_new(object, "crs", json_string(tl_crs_name(info->georef.crs)));
+        json_object_set_new(object, "crs_wkt", json_string(tl_crs_wkt(info->georef.crs)));
+    }
+    json_t *parameters = json_object();
+    for (size_t i = 0; i < info->parameter_count; i++)
+        json_object_set_new(parameters, info->parameters[i].name, json_string(info->parameters[i].value));
+    json_object_set_new(object, "parameters", parameters);
+}
+
 static const char *const meanings[] = {
     [OUT_HEIGHTMAP_PNG16] = "height = offset + scale * value",
     [OUT_HEIGHTMAP_R16] = "height = offset + scale * value; rows of unsigned 16-bit values, the low byte first",
@@ -165,8 +181,6 @@ static json_t *sidecar(const tl_source_info *info, const tl_range *range, const 
 {
     const out_coding *code = &how->code;
     bool floats = how->kind == OUT_HEIGHTMAP_RAW32;
-    double t[6];
-    out_gdal_transform(info, t);
     bool empty = range->voids == range->samples;
     json_t *object =
         json_pack("{s:I, s:I, s:f, s:f, s:o, s:o, s:o, s:s, s:[f,f], s:f}", "width", (json_int_t)info->width, "height",
@@ -179,16 +193,7 @@ static json_t *sidecar(const tl_source_info *info, const tl_range *range, const 
     if (!object)
         return NULL;
     json_object_set_new(object, "meaning", json_string(meanings[how->kind]));
-    if (info->georef.located)
-        json_object_set_new(object, "geotransform", json_pack("[f,f,f,f,f,f]", t[0], t[1], t[2], t[3], t[4], t[5]));
-    if (info->georef.crs) {
-        json_object_set_new(object, "crs", json_string(tl_crs_name(info->georef.crs)));
-        json_object_set_new(object, "crs_wkt", json_string(tl_crs_wkt(info->georef.crs)));
-    }
-    json_t *parameters = json_object();
-    for (size_t i = 0; i < info->parameter_count; i++)
-        json_object_set_new(parameters, info->parameters[i].name, json_string(info->parameters[i].value));
-    json_object_set_new(object, "parameters", parameters);
+    out_json_add_record(object, info);
     return object;
 }
 

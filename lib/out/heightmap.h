@@ -6,6 +6,8 @@
 #include "lib/out/out.h"
 #include "lib/out/png_encoder.h"
 
+#include <jansson.h>
+
 typedef enum out_heightmap_kind {
     OUT_HEIGHTMAP_PNG16 = 0,
     OUT_HEIGHTMAP_R16,  /* unsigned 16-bit values, the low byte first */
@@ -30,5 +32,8 @@ typedef struct out_heightmap {
 
 tl_status out_heightmap_write(const tl_source *source, const out_heightmap *how, tl_output *output, const tl_run *run,
                               tl_error *error);
+
+/* Adds where a grid lies and how it was made: geotransform, crs, crs_wkt and parameters. */
+void out_json_add_record(json_t *object, const tl_source_info *info);
 
 #endif

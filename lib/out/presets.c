@@ -278,6 +278,7 @@ static void take_back(const writing *w)
 
 static tl_status write_exr(writing *w, tl_error *error)
 {
+    w->older[0] = access(w->path, F_OK) == 0;
     tl_output *output = tl_output_open(w->path, w->options->overwrite, error);
     if (!output)
         return TL_ERROR_IO;
@@ -327,8 +328,6 @@ static json_t *describe(const writing *w)
 {
     const tl_source_info *info = &w->part->info;
     const tl_preset_report *r = w->report;
-    double t[6];
-    out_gdal_transform(info, t);
     bool floats = !w->of->sizes[0];
     json_t *root = json_pack("{s:s, s:I, s:I, s:I, s:I, s:f, s:f, s:f, s:f, s:b, s:[f,f], s:f, s:o, s:o}", "preset",
                              w->preset->name, "width", (json_int_t)info->width, "height", (json_int_t)info->height,
@@ -339,16 +338,7 @@ static json_t *describe(const writing *w)
                              "tiles", list_tiles(w), "import", list_lines(r->import));
     if (!root)
         return NULL;
-    if (info->georef.located)
-        json_object_set_new(root, "geotransform", json_pack("[f,f,f,f,f,f]", t[0], t[1], t[2], t[3], t[4], t[5]));
-    if (info->georef.crs) {
-        json_object_set_new(root, "crs", json_string(tl_crs_name(info->georef.crs)));
-        json_object_set_new(root, "crs_wkt", json_string(tl_crs_wkt(info->georef.crs)));
-    }
-    json_t *parameters = json_object();
-    for (size_t i = 0; i < info->parameter_count; i++)
-        json_object_set_new(parameters, info->parameters[i].name, json_string(info->parameters[i].value));
-    json_object_set_new(root, "parameters", parameters);
+    out_json_add_record(root, info);
     return root;
 }
 

@@ -1,12 +1,12 @@
 #include "lib/scene/mesh_raster.h"
 
+#include "lib/scene/fill_rule.h"
+
 #include <math.h>
 #include <stdbool.h>
 #include <string.h>
 
 enum {
-    SUBPIXELS = 256,
-    GUARD = 1 << 20, /* pixels around the block within which corners lie: edge functions then stay below 2^62 */
     PLANES = 5,
     CLIPPED_MAX = 3 + PLANES, /* corners of a triangle cut by the planes: each adds one at most */
 };
@@ -20,67 +20,20 @@ void scene_canvas_clear(scene_canvas *canvas)
 
 /* ---- rasterising ---- */
 
-/* A corner on the block's own grid of subpixels. */
 typedef struct spot {
-    int64_t x, y;
+    scene_pixel at;
     double nearness;
 } spot;
-
-static int64_t snap(double pixels)
-{
-    double most = 2.0 * GUARD;
-    if (!(pixels > -most)) /* also NaN */
-        pixels = -most;
-    return (int64_t)floor((pixels < most ? pixels : most) * SUBPIXELS + 0.5);
-}
 
 static spot project(const scene_canvas *z, const double corner[3])
 {
     double nearness = 1 / corner[2];
-    return (spot){snap(corner[0] * nearness - z->left), snap(corner[1] * nearness - z->top), nearness};
-}
-
-/* An edge function, at least 0 inside: it grows by dx from pixel to pixel and by dy from row to row. A pixel's centre
- * on the edge itself belongs to one side only: that is what the bias is for. */
-typedef struct edge {
-    int64_t start, dx, dy, bias;
-} edge;
-
-static edge edge_of(const spot *from, const spot *to, int64_t x, int64_t y)
-{
-    int64_t ex = to->x - from->x, ey = to->y - from->y;
-    edge e = {.dx = -ey * SUBPIXELS, .dy = ex * SUBPIXELS};
-    e.bias = ey < 0 || (ey == 0 && ex > 0) ? 0 : -1;
-    e.start = ex * (y - from->y) - ey * (x - from->x);
-    return e;
-}
-
-static int64_t low3(int64_t a, int64_t b, int64_t c)
-{
-    int64_t m = a < b ? a : b;
-    return m < c ? m : c;
-}
-
-static int64_t high3(int64_t a, int64_t b, int64_t c)
-{
-    return -low3(-a, -b, -c);
-}
-
-/* The first pixel whose centre is at or behind a position, and the last one at or before it. */
-static int64_t first_pixel(int64_t position)
-{
-    int64_t p = (position + SUBPIXELS / 2 - 1) >> 8;
-    return p < 0 ? 0 : p;
-}
-
-static int64_t last_pixel(int64_t position, int size)
-{
-    int64_t p = (position - SUBPIXELS / 2) >> 8;
-    return p > size - 1 ? size - 1 : p;
+    return (spot){{scene_snap(corner[0] * nearness - z->left), scene_snap(corner[1] * nearness - z->top)}, nearness};
 }
 
 /* The pixels of a row, from the first on. */
-static void fill_row(scene_hit *line, int64_t count, const edge e[3], double nearness, double step, uint32_t triangle)
+static void fill_row(scene_hit *line, int64_t count, const scene_edge e[3], double nearness, double step,
+                     uint32_t triangle)
 {
     int64_t v[3] = {e[0].start + e[0].bias, e[1].start + e[1].bias, e[2].start + e[2].bias};
     for (int64_t k = 0; k < count; k++) {
@@ -96,12 +49,9 @@ static void fill_row(scene_hit *line, int64_t count, const edge e[3], double nea
 
 static void fill(scene_canvas *z, const spot *a, const spot *b, const spot *c, uint32_t triangle)
 {
-    int64_t x0 = first_pixel(low3(a->x, b->x, c->x)), x1 = last_pixel(high3(a->x, b->x, c->x), z->width);
-    int64_t y0 = first_pixel(low3(a->y, b->y, c->y)), y1 = last_pixel(high3(a->y, b->y, c->y), z->height);
-    if (x0 > x1 || y0 > y1)
-        return;
-    int64_t area = (b->x - a->x) * (c->y - a->y) - (b->y - a->y) * (c->x - a->x);
-    if (area == 0)
+    scene_span in = scene_span_of(a->at, b->at, c->at, z->width, z->height);
+    int64_t area = scene_twice_area(a->at, b->at, c->at);
+    if (in.x0 > in.x1 || in.y0 > in.y1 || area == 0)
         return;
     if (area < 0) {
         const spot *swap = b;
@@ -109,17 +59,18 @@ static void fill(scene_canvas *z, const spot *a, const spot *b, const spot *c, u
         c = swap;
         area = -area;
     }
-    int64_t x = x0 * SUBPIXELS + SUBPIXELS / 2, y = y0 * SUBPIXELS + SUBPIXELS / 2;
-    edge e[3] = {edge_of(b, c, x, y), edge_of(c, a, x, y), edge_of(a, b, x, y)};
+    scene_pixel at = scene_centre(in.x0, in.y0);
+    scene_edge e[3] = {scene_edge_of(b->at, c->at, at), scene_edge_of(c->at, a->at, at),
+                       scene_edge_of(a->at, b->at, at)};
     const double near[3] = {a->nearness, b->nearness, c->nearness};
     double scale = 1 / (double)area, step = 0;
     for (int k = 0; k < 3; k++)
         step += (double)e[k].dx * scale * near[k];
-    for (int64_t row = y0; row <= y1; row++) {
+    for (int64_t row = in.y0; row <= in.y1; row++) {
         double nearness = 0;
         for (int k = 0; k < 3; k++)
             nearness += (double)e[k].start * scale * near[k];
-        fill_row(z->hits + row * z->width + x0, x1 - x0 + 1, e, nearness, step, triangle);
+        fill_row(z->hits + row * z->width + in.x0, in.x1 - in.x0 + 1, e, nearness, step, triangle);
         for (int k = 0; k < 3; k++)
             e[k].start += e[k].dy;
     }
@@ -160,7 +111,7 @@ static int clip(const plane *h, double (*in)[3], int count, double (*out)[3])
 /* The planes that corners must be inside of: in front of the eye, and not so far aside that integers overflow. */
 static void planes_of(const scene_canvas *z, plane out[PLANES])
 {
-    double guard = GUARD * 0.999; /* so that rounding does not leave it again */
+    double guard = SCENE_GUARD * 0.999; /* so that rounding does not leave it again */
     double left = guard - z->left, right = z->left + z->width + guard;
     double above = guard - z->top, below = z->top + z->height + guard;
     out[0] = (plane){{0, 0, 1}, near_plane};
@@ -194,7 +145,7 @@ static void clip_and_fill(scene_canvas *z, const plane planes[PLANES], int cuts,
 /* Whether a corner needs no cutting: its pixel is as far from the block as is allowed, at most. */
 static bool inside(const scene_canvas *z, const double at[3])
 {
-    double reach = GUARD / 2 * at[2];
+    double reach = SCENE_GUARD / 2 * at[2];
     return at[2] >= near_plane && fabs(at[0] - z->left * at[2]) < reach && fabs(at[1] - z->top * at[2]) < reach;
 }
 

@@ -1,12 +1,12 @@
 #include "lib/scene/zbuffer.h"
 
+#include "lib/scene/fill_rule.h"
+
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
 
 enum {
-    SUBPIXELS = 256,
-    GUARD = 1 << 20,  /* pixels around the block within which corners lie: edge functions then stay below 2^62 */
     CLIPPED_MAX = 10, /* corners of a triangle cut by five planes: each adds one at most */
 };
 
@@ -17,52 +17,22 @@ void scene_zbuffer_clear(scene_zbuffer *buffer)
 
 /* ---- rasterising ---- */
 
-/* A corner on the block's own grid of subpixels. */
 typedef struct spot {
-    int64_t x, y;
+    scene_pixel at;
     float nearness, height, east, north; /* the last three over w, so that they are linear on the screen */
 } spot;
-
-/* Corners lie within the guard but for what clipping lost to rounding, which can be all where coordinates are 1e30. */
-static int64_t snap(double pixels)
-{
-    double most = 2.0 * GUARD;
-    if (!(pixels > -most)) /* also NaN */
-        pixels = -most;
-    return (int64_t)floor((pixels < most ? pixels : most) * SUBPIXELS + 0.5);
-}
 
 static spot project(const scene_zbuffer *z, const scene_corner *c)
 {
     double nearness = 1 / c->w;
     spot s;
-    s.x = snap(c->x * nearness - z->left);
-    s.y = snap(c->y * nearness - z->top);
+    s.at.x = scene_snap(c->x * nearness - z->left);
+    s.at.y = scene_snap(c->y * nearness - z->top);
     s.nearness = (float)nearness;
     s.height = (float)((double)c->height * nearness);
     s.east = (float)((double)c->east * nearness);
     s.north = (float)((double)c->north * nearness);
     return s;
-}
-
-static int64_t twice_area(const spot *a, const spot *b, const spot *c)
-{
-    return (b->x - a->x) * (c->y - a->y) - (b->y - a->y) * (c->x - a->x);
-}
-
-/* An edge function, at least 0 inside: it grows by dx from pixel to pixel and by dy from row to row. A pixel's centre
- * on the edge itself belongs to one side only: that is what the bias is for. */
-typedef struct edge {
-    int64_t start, dx, dy, bias;
-} edge;
-
-static edge edge_of(const spot *from, const spot *to, int64_t x, int64_t y)
-{
-    int64_t ex = to->x - from->x, ey = to->y - from->y;
-    edge e = {.dx = -ey * SUBPIXELS, .dy = ex * SUBPIXELS};
-    e.start = ex * (y - from->y) - ey * (x - from->x);
-    e.bias = ey < 0 || (ey == 0 && ex > 0) ? 0 : -1;
-    return e;
 }
 
 static void shade_fragment(scene_fragment *f, const spot *const s[3], const double part[3])
@@ -81,34 +51,11 @@ static void shade_fragment(scene_fragment *f, const spot *const s[3], const doub
                           (float)(north / nearness)};
 }
 
-static int64_t low3(int64_t a, int64_t b, int64_t c)
-{
-    int64_t m = a < b ? a : b;
-    return m < c ? m : c;
-}
-
-static int64_t high3(int64_t a, int64_t b, int64_t c)
-{
-    return -low3(-a, -b, -c);
-}
-
-/* The first pixel whose centre is at or behind a position, and the last one at or before it. */
-static int64_t first_pixel(int64_t position)
-{
-    int64_t p = (position + SUBPIXELS / 2 - 1) >> 8;
-    return p < 0 ? 0 : p;
-}
-
-static int64_t last_pixel(int64_t position, int size)
-{
-    int64_t p = (position - SUBPIXELS / 2) >> 8;
-    return p > size - 1 ? size - 1 : p;
-}
-
 static void fill(scene_zbuffer *z, const spot *a, const spot *b, const spot *c)
 {
-    int64_t area = twice_area(a, b, c);
-    if (area == 0)
+    scene_span in = scene_span_of(a->at, b->at, c->at, z->width, z->height);
+    int64_t area = scene_twice_area(a->at, b->at, c->at);
+    if (in.x0 > in.x1 || in.y0 > in.y1 || area == 0)
         return;
     if (area < 0) {
         const spot *swap = b;
@@ -116,18 +63,15 @@ static void fill(scene_zbuffer *z, const spot *a, const spot *b, const spot *c)
         c = swap;
         area = -area;
     }
-    int64_t x0 = first_pixel(low3(a->x, b->x, c->x)), x1 = last_pixel(high3(a->x, b->x, c->x), z->width);
-    int64_t y0 = first_pixel(low3(a->y, b->y, c->y)), y1 = last_pixel(high3(a->y, b->y, c->y), z->height);
-    if (x0 > x1 || y0 > y1)
-        return;
-    int64_t x = x0 * SUBPIXELS + SUBPIXELS / 2, y = y0 * SUBPIXELS + SUBPIXELS / 2;
+    scene_pixel at = scene_centre(in.x0, in.y0);
     const spot *const corners[3] = {a, b, c};
-    edge e[3] = {edge_of(b, c, x, y), edge_of(c, a, x, y), edge_of(a, b, x, y)};
+    scene_edge e[3] = {scene_edge_of(b->at, c->at, at), scene_edge_of(c->at, a->at, at),
+                       scene_edge_of(a->at, b->at, at)};
     double scale = 1 / (double)area;
-    for (int64_t row = y0; row <= y1; row++) {
+    for (int64_t row = in.y0; row <= in.y1; row++) {
         int64_t v[3] = {e[0].start, e[1].start, e[2].start};
         scene_fragment *line = z->fragments + row * z->width;
-        for (int64_t column = x0; column <= x1; column++) {
+        for (int64_t column = in.x0; column <= in.x1; column++) {
             if (((v[0] + e[0].bias) | (v[1] + e[1].bias) | (v[2] + e[2].bias)) >= 0) {
                 const double part[3] = {(double)v[0] * scale, (double)v[1] * scale, (double)v[2] * scale};
                 shade_fragment(&line[column], corners, part);
@@ -177,7 +121,7 @@ static int clip(const plane *p, const scene_corner *in, int count, scene_corner 
 /* The planes that corners must be inside of: in front of the eye, and not so far aside that integers overflow. */
 static void planes_of(const scene_zbuffer *z, plane out[5])
 {
-    double guard = GUARD * 0.999; /* so that rounding does not leave it again */
+    double guard = SCENE_GUARD * 0.999; /* so that rounding does not leave it again */
     double right = z->left + z->width + guard, bottom = z->top + z->height + guard;
     out[0] = (plane){0, 0, 1, z->near_plane};
     out[1] = (plane){1, 0, guard - z->left, 0};
