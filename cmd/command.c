@@ -17,6 +17,7 @@ const char *const frame_names[] = {[TL_FRAME_DEFAULT] = "default",
                                    [TL_FRAME_ENU] = "enu",
                                    [TL_FRAME_PROJECTED] = "projected",
                                    [TL_FRAME_PIXEL] = "pixel",
+                                   [TL_FRAME_ECEF] = "ecef",
                                    NULL};
 
 static void print_help(const command *self, const option_group *groups)

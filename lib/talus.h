@@ -382,6 +382,9 @@ typedef enum tl_frame {
     TL_FRAME_ENU,         /* metres east, north and up of the tangent plane at the grid's middle (glTF: its Y up) */
     TL_FRAME_PROJECTED,   /* CRS coordinates and heights as they are */
     TL_FRAME_PIXEL,       /* column, row (downwards), height: sample positions, not cell corners */
+    /* Metres from the centre of the ellipsoid (X towards Greenwich, Z north), on the CRS's own datum, heights taken for
+     * ellipsoidal ones. A GLB has ENU positions and a node whose matrix takes them there. */
+    TL_FRAME_ECEF,
 } tl_frame;
 
 /* The full grid as a mesh: two triangles a cell, none where a corner is void (one where only one is). Grids

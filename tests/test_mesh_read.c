@@ -5,6 +5,7 @@
 #include "lib/talus.h"
 
 #include <math.h>
+#include <proj.h>
 #include <setjmp.h>
 #include <stdarg.h>
 #include <stdio.h>
@@ -257,6 +258,72 @@ static void boundsCountTheSteps(void **state)
     tl_crs_release(crs);
 }
 
+/* Distance of the file's vertices from where PROJ has those of the mesh, at most; by the nearest, as files order them
+ * as they like. */
+static double farthest_from_proj(const char *path, const tl_mesh *mesh)
+{
+    out_mesh_file file;
+    assert_int_equal(out_mesh_read(path, &file, NULL), TL_OK);
+    PJ *geocentric = proj_create_crs_to_crs(NULL, "EPSG:4979", "EPSG:4978", NULL);
+    assert_non_null(geocentric);
+    double farthest = 0;
+    for (size_t k = 0; k < mesh->vertex_count; k += 97) {
+        const tl_vertex *v = &mesh->vertices[k];
+        double x = v->i, y = v->j, nearest = HUGE_VAL;
+        assert_int_equal(tl_georef_to_lonlat(&mesh->georef, 1, &x, &y, NULL), TL_OK);
+        PJ_COORD at = proj_trans(geocentric, PJ_FWD, proj_coord(y, x, (double)v->z, 0));
+        for (size_t n = 0; n < file.vertex_count; n++)
+            nearest = fmin(nearest,
+                           hypot(hypot(file.xyz[n][0] - at.v[0], file.xyz[n][1] - at.v[1]), file.xyz[n][2] - at.v[2]));
+        farthest = fmax(farthest, nearest);
+    }
+    proj_destroy(geocentric);
+    out_mesh_free(&file);
+    return farthest;
+}
+
+/* Every format has them where PROJ has them, and keeps the bound. */
+static void geocentricMeshesLieWhereTheyShould(void **state)
+{
+    (void)state;
+    tl_crs *crs = NULL;
+    assert_int_equal(dem_crs_from_text("EPSG:32633", "test", &crs, NULL), TL_OK);
+    for (int kind = 0; kind < 6; kind++) {
+        const char *path = path_of(kind < 4 ? endings[kind] : "glb");
+        tl_mesh_coding coding = kind < 4 ? TL_CODING_PLAIN : kind == 4 ? TL_CODING_QUANTIZED : TL_CODING_COMPRESSED;
+        grid of = {120, 90, malloc(120 * 90 * sizeof(float))};
+        for (int k = 0; k < 120 * 90; k++)
+            of.z[k] = (float)(900 + 40 * sin(k % 120 * .3) * cos(k / 120 * .21));
+        tl_source *source = open_grid(&of);
+        const double transform[6] = {400000, 30, 0, 5100000, 0, -30};
+        memcpy(source->info.georef.transform, transform, sizeof transform);
+        source->info.georef.located = true;
+        source->info.georef.crs = crs;
+        source->info.georef.cell_x = source->info.georef.cell_y = 30;
+        tl_write_options writing = {.overwrite = true, .coding = coding, .frame = TL_FRAME_ECEF};
+        tl_framework_options options = {
+            .max_error = 2, .frame = TL_FRAME_ECEF, .rounding = tl_write_rounding(&source->info, path, &writing)};
+        tl_framework *framework = tl_framework_build(source, &options, NULL);
+        tl_mesh *mesh = NULL;
+        tl_mesh_report read;
+        assert_int_equal(tl_framework_mesh(framework, &mesh, NULL), TL_OK);
+        assert_int_equal(tl_write_mesh(mesh, path, &writing, NULL), TL_OK);
+        assert_int_equal(tl_mesh_verify_file(path, mesh, source, NULL, TL_FRAME_ECEF, NULL, &read, NULL), TL_OK);
+        assert_true(read.max_error <= 2 && read.max_error > 1);
+        assert_int_equal(read.samples, 120 * 90);
+        /* half a step of 16 bits over 3.6 km, or of single precision; micrometres of text and doubles */
+        double off = farthest_from_proj(path, mesh), most = kind >= 4 ? 0.05 : kind >= 2 ? 4e-4 : 2e-6;
+        if (!(off <= most))
+            fail_msg("%s: %g m from where it should be", path, off);
+        tl_mesh_destroy(mesh);
+        tl_framework_destroy(framework);
+        tl_source_destroy(source);
+        free(of.z);
+        assert_int_equal(unlink(path), 0);
+    }
+    tl_crs_release(crs);
+}
+
 static size_t load(const char *path, unsigned char **bytes)
 {
     FILE *file = fopen(path, "rb");
@@ -325,6 +392,7 @@ int main(void)
         cmocka_unit_test(samplesAreHeldToTheirOwnBounds),
         cmocka_unit_test(stepsAddWhatIsSaid),
         cmocka_unit_test(boundsCountTheSteps),
+        cmocka_unit_test(geocentricMeshesLieWhereTheyShould),
         cmocka_unit_test(damagedFilesAreRefusedOrRead),
     };
     return cmocka_run_group_tests(tests, make_folder, remove_folder);

@@ -2,15 +2,18 @@
 
 #include "dem/control_grid.h"
 #include "dem/crs.h"
+#include "dem/crs_ellipsoidal.h"
 #include "lib/base/error.h"
 
 #include <math.h>
 #include <stdlib.h>
+#include <string.h>
 
 const char *const out_frame_names[] = {[TL_FRAME_DEFAULT] = "default",
                                        [TL_FRAME_ENU] = "enu",
                                        [TL_FRAME_PROJECTED] = "projected",
-                                       [TL_FRAME_PIXEL] = "pixel"};
+                                       [TL_FRAME_PIXEL] = "pixel",
+                                       [TL_FRAME_ECEF] = "ecef"};
 
 struct out_frame {
     tl_frame kind;
@@ -20,6 +23,7 @@ struct out_frame {
     dem_local_frame *local;
     dem_control_grid *grid; /* of positions on the ellipsoid and of the way up; NULL: each vertex by itself */
     double origin[3];
+    double axes[3][3], centre[3]; /* of the tangent plane, geocentric: east, north, up, and its origin */
 };
 
 enum { BATCH = 1024, MANY = 1 << 20 };
@@ -29,6 +33,12 @@ static void position(const tl_georef *g, double i, double j, double *x, double *
     const double *t = g->transform;
     *x = t[0] + t[1] * i + t[2] * j;
     *y = t[3] + t[4] * i + t[5] * j;
+}
+
+/* Whether places are found in the tangent plane. */
+static bool frame_is_tangent(tl_frame kind)
+{
+    return kind == TL_FRAME_ENU || kind == TL_FRAME_ECEF;
 }
 
 /* The vertices' box: columns, rows, heights. */
@@ -97,6 +107,22 @@ static tl_status begin_grid(out_frame *frame, const double low[3], const double 
     return dem_control_grid_create(&f, window, vertices / 4, &frame->grid, error);
 }
 
+/* [Hofmann-Wellenhof et al., Physical Geodesy: ellipsoidal to Cartesian coordinates] */
+static void find_axes(out_frame *frame)
+{
+    const double degree = 0x1.1df46a2529d39p-6; /* pi / 180 */
+    const tl_crs *crs = frame->georef->crs;
+    double longitude = (frame->origin[0] + dem_crs_prime_meridian(crs)) * degree;
+    double latitude = frame->origin[1] * degree, height = frame->origin[2];
+    double c = cos(longitude), s = sin(longitude), cn = cos(latitude), sn = sin(latitude);
+    double e2 = crs->flattening * (2 - crs->flattening), normal = crs->semi_major / sqrt(1 - e2 * sn * sn);
+    const double axes[3][3] = {{-s, c, 0}, {-sn * c, -sn * s, cn}, {cn * c, cn * s, sn}};
+    memcpy(frame->axes, axes, sizeof axes);
+    frame->centre[0] = (normal + height) * cn * c;
+    frame->centre[1] = (normal + height) * cn * s;
+    frame->centre[2] = (normal * (1 - e2) + height) * sn;
+}
+
 static tl_status begin_enu(out_frame *frame, const tl_mesh *mesh, const char *path, tl_error *error)
 {
     const tl_georef *g = frame->georef;
@@ -115,7 +141,10 @@ static tl_status begin_enu(out_frame *frame, const tl_mesh *mesh, const char *pa
                        "%s: the raster's middle has no longitude and latitude in %s; use --frame projected", path,
                        tl_crs_name(g->crs));
     frame->local = dem_local_frame_create(g->crs, frame->origin[0], frame->origin[1], frame->origin[2], error);
-    return frame->local ? begin_grid(frame, low, high, mesh->vertex_count, error) : TL_ERROR_DATA;
+    if (!frame->local)
+        return TL_ERROR_DATA;
+    find_axes(frame);
+    return begin_grid(frame, low, high, mesh->vertex_count, error);
 }
 
 out_frame *out_frame_create(const tl_mesh *mesh, tl_frame kind, const char *path, tl_error *error)
@@ -130,7 +159,7 @@ out_frame *out_frame_create(const tl_mesh *mesh, tl_frame kind, const char *path
     if (kind == TL_FRAME_DEFAULT)
         kind = mesh->georef.crs && mesh->georef.located ? TL_FRAME_ENU : TL_FRAME_PROJECTED;
     frame->kind = kind;
-    if (kind == TL_FRAME_ENU && begin_enu(frame, mesh, path, error) != TL_OK) {
+    if (frame_is_tangent(kind) && begin_enu(frame, mesh, path, error) != TL_OK) {
         out_frame_destroy(frame);
         return NULL;
     }
@@ -201,12 +230,38 @@ static tl_status apply_enu(out_frame *frame, const tl_vertex *v, size_t n, doubl
     return TL_OK;
 }
 
+void out_frame_to_ecef(const out_frame *frame, const double enu[3], double out[3])
+{
+    for (int a = 0; a < 3; a++)
+        out[a] =
+            frame->centre[a] + frame->axes[0][a] * enu[0] + frame->axes[1][a] * enu[1] + frame->axes[2][a] * enu[2];
+}
+
+void out_frame_from_ecef(const out_frame *frame, const double ecef[3], double out[3])
+{
+    double d[3];
+    for (int a = 0; a < 3; a++)
+        d[a] = ecef[a] - frame->centre[a];
+    for (int a = 0; a < 3; a++)
+        out[a] = frame->axes[a][0] * d[0] + frame->axes[a][1] * d[1] + frame->axes[a][2] * d[2];
+}
+
+void out_frame_tangent(const out_frame *frame, double axes[3][3], double centre[3])
+{
+    memcpy(axes, frame->axes, sizeof frame->axes);
+    memcpy(centre, frame->centre, sizeof frame->centre);
+}
+
 tl_status out_frame_apply(out_frame *frame, const tl_vertex *v, size_t n, double (*xyz)[3], tl_error *error)
 {
     tl_status status = TL_OK;
-    if (frame->kind == TL_FRAME_ENU) {
+    if (frame_is_tangent(frame->kind)) {
         for (size_t k = 0; k < n && status == TL_OK; k += BATCH)
             status = apply_enu(frame, v + k, n - k < BATCH ? n - k : BATCH, xyz + k, error);
+        for (size_t k = 0; k < n && status == TL_OK && frame->kind == TL_FRAME_ECEF; k++) {
+            const double enu[3] = {xyz[k][0], xyz[k][1], xyz[k][2]};
+            out_frame_to_ecef(frame, enu, xyz[k]);
+        }
         return status;
     }
     for (size_t k = 0; k < n; k++) {

@@ -62,8 +62,10 @@ typedef struct model {
     size_t vertex_count;
     uint32_t *indices;
     size_t index_count;
-    float low[3], high[3]; /* of the positions */
-    double origin[3];      /* added to positions by the node, so that the floats are small */
+    float low[3], high[3];        /* of the positions */
+    double origin[3];             /* added to positions by the node, so that the floats are small */
+    bool geocentric;              /* the node's matrix takes the tangent plane to where it lies */
+    double axes[3][3], centre[3]; /* of the tangent plane */
 } model;
 
 /* glTF's Y points up: (east, north, up) becomes (x, z up, -y). */
@@ -364,10 +366,11 @@ static json_t *triple(const double v[3])
     return json_pack("[f,f,f]", v[0], v[1], v[2]);
 }
 
-static json_t *extras(const tl_mesh *mesh, const out_frame *frame)
+static json_t *extras(const tl_mesh *mesh, const out_frame *frame, bool geocentric)
 {
-    json_t *object = json_pack("{s:s, s:s, s:f}", "talus", tl_version(), "frame",
-                               out_frame_names[out_frame_kind(frame)], "max_error", mesh->max_error);
+    tl_frame kind = geocentric ? TL_FRAME_ECEF : out_frame_kind(frame);
+    json_t *object = json_pack("{s:s, s:s, s:f}", "talus", tl_version(), "frame", out_frame_names[kind], "max_error",
+                               mesh->max_error);
     if (mesh->georef.crs) {
         json_object_set_new(object, "crs", json_string(tl_crs_name(mesh->georef.crs)));
         json_object_set_new(object, "crs_wkt", json_string(tl_crs_wkt(mesh->georef.crs)));
@@ -494,6 +497,30 @@ static void add_geometry(const model *m, json_t *root)
     json_object_set_new(root, "extensionsRequired", json_copy(used));
 }
 
+/* Of a model in the tangent plane, whose steps and corner are those of quantised positions, column by column. */
+static json_t *geocentric_matrix(const model *m, const double corner[3])
+{
+    const double one[3] = {1, 1, 1}, *step = m->coding == TL_CODING_PLAIN ? one : m->step;
+    const double *const axes[3] = {m->axes[0], m->axes[2], m->axes[1]}; /* east, up, north, which points backwards */
+    const double sign[3] = {1, 1, -1};
+    double place[3], turned[3];
+    json_t *matrix = json_array();
+    memcpy(place, m->centre, sizeof place);
+    for (int c = 0; c < 3; c++) {
+        to_gltf(axes[c], turned);
+        for (int a = 0; a < 3; a++) {
+            json_array_append_new(matrix, json_real(sign[c] * step[c] * turned[a]));
+            place[a] += sign[c] * corner[c] * axes[c][a];
+        }
+        json_array_append_new(matrix, json_real(0));
+    }
+    to_gltf(place, turned);
+    for (int a = 0; a < 3; a++)
+        json_array_append_new(matrix, json_real(turned[a]));
+    json_array_append_new(matrix, json_real(1));
+    return matrix;
+}
+
 static json_t *describe_node(const model *m)
 {
     json_t *node = json_pack("{s:i, s:s}", "mesh", 0, "name", "terrain");
@@ -501,6 +528,10 @@ static json_t *describe_node(const model *m)
     bool plain = m->coding == TL_CODING_PLAIN;
     for (int a = 0; a < 3; a++)
         at[a] = m->origin[a] + (plain ? 0 : (double)m->low[a]);
+    if (m->geocentric) {
+        json_object_set_new(node, "matrix", geocentric_matrix(m, at));
+        return node;
+    }
     if (at[0] != 0 || at[1] != 0 || at[2] != 0)
         json_object_set_new(node, "translation", triple(at));
     if (!plain)
@@ -521,13 +552,13 @@ static void add_target(json_t *root)
 
 static char *describe(const tl_mesh *mesh, const out_frame *frame, const model *m)
 {
-    json_t *root =
-        json_pack("{s:{s:s, s:s, s:o}, s:i, s:[{s:[i]}], s:[o], s:[{s:[{s:{s:i,s:i}, s:i, s:i, s:i}]}], "
-                  "s:[{s:{s:[f,f,f,f], s:f, s:f}}]}",
-                  "asset", "version", "2.0", "generator", "talus", "extras", extras(mesh, frame), "scene", 0, "scenes",
-                  "nodes", 0, "nodes", describe_node(m), "meshes", "primitives", "attributes", "POSITION", 0, "NORMAL",
-                  1, "indices", 2, "mode", MODE_TRIANGLES, "material", 0, "materials", "pbrMetallicRoughness",
-                  "baseColorFactor", 0.55, 0.52, 0.46, 1.0, "metallicFactor", 0.0, "roughnessFactor", 1.0);
+    json_t *root = json_pack("{s:{s:s, s:s, s:o}, s:i, s:[{s:[i]}], s:[o], s:[{s:[{s:{s:i,s:i}, s:i, s:i, s:i}]}], "
+                             "s:[{s:{s:[f,f,f,f], s:f, s:f}}]}",
+                             "asset", "version", "2.0", "generator", "talus", "extras",
+                             extras(mesh, frame, m->geocentric), "scene", 0, "scenes", "nodes", 0, "nodes",
+                             describe_node(m), "meshes", "primitives", "attributes", "POSITION", 0, "NORMAL", 1,
+                             "indices", 2, "mode", MODE_TRIANGLES, "material", 0, "materials", "pbrMetallicRoughness",
+                             "baseColorFactor", 0.55, 0.52, 0.46, 1.0, "metallicFactor", 0.0, "roughnessFactor", 1.0);
     if (root)
         add_geometry(m, root);
     if (root && m->morphs)
@@ -589,10 +620,14 @@ tl_status out_gltf_write(const tl_mesh *mesh, tl_output *output, const tl_write_
         return tl_fail(error, TL_ERROR_ARGUMENT, "%s: heights of parents are kept as floats; leave the coding away",
                        path);
     tl_status status = tl_run_check(options->run, error);
-    out_frame *frame = status == TL_OK ? out_frame_create(mesh, options->frame, path, error) : NULL;
+    bool geocentric = options->frame == TL_FRAME_ECEF; /* floats hold a tangent plane's metres, not the Earth's */
+    tl_frame kind = geocentric ? TL_FRAME_ENU : options->frame;
+    out_frame *frame = status == TL_OK ? out_frame_create(mesh, kind, path, error) : NULL;
     if (!frame)
         return status == TL_OK ? TL_ERROR_DATA : status;
-    model m = {.coding = options->coding, .level_steps = out_frame_kind(frame) == TL_FRAME_PIXEL};
+    model m = {
+        .coding = options->coding, .level_steps = out_frame_kind(frame) == TL_FRAME_PIXEL, .geocentric = geocentric};
+    out_frame_tangent(frame, m.axes, m.centre);
     status = first_position(mesh, frame, m.origin, error);
     if (status == TL_OK)
         status = build(mesh, frame, &m, options->parent_heights, path, error);

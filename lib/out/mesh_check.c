@@ -202,8 +202,12 @@ tl_status tl_mesh_verify_file(const char *path, const tl_mesh *mesh, const tl_so
     self.cell = step_of(&self);
     memcpy(self.origin, out_frame_origin(made), sizeof self.origin);
     bool faces_up = out_frame_faces_up(made);
-    out_frame_destroy(made);
     tl_status status = out_mesh_read(path, &self.file, error);
+    for (size_t k = 0; status == TL_OK && self.kind == TL_FRAME_ECEF && k < self.file.vertex_count; k++) {
+        const double geocentric[3] = {self.file.xyz[k][0], self.file.xyz[k][1], self.file.xyz[k][2]};
+        out_frame_from_ecef(made, geocentric, self.file.xyz[k]);
+    }
+    out_frame_destroy(made);
     if (status == TL_OK)
         status = measure(&self, faces_up, source, bounds, run, out, error);
     out_mesh_free(&self.file);

@@ -213,6 +213,9 @@ static tl_status read_stl(bytes *in, out_mesh_file *out, tl_error *error)
     const char *from_text = strstr(head, " projected from ");
     if (from_text && sscanf(from_text, " projected from %lf %lf", &origin[0], &origin[1]) != 2)
         return malformed(in, "its header", error);
+    from_text = strstr(head, " ecef from ");
+    if (from_text && sscanf(from_text, " ecef from %lf %lf %lf", &origin[0], &origin[1], &origin[2]) != 3)
+        return malformed(in, "its header", error);
     for (size_t k = 0; k < out->vertex_count; k++) {
         const unsigned char *from = in->all + HEAD + k / 3 * RECORD + 12 + k % 3 * 12;
         for (int a = 0; a < 3; a++)
@@ -308,19 +311,25 @@ static tl_status take_items(json_t *node, const bytes *binary, const items *at, 
                             tl_error *error)
 {
     json_t *translation = json_object_get(node, "translation"), *scale = json_object_get(node, "scale");
-    double factor[3];
+    json_t *matrix = json_object_get(node, "matrix");
+    double column[4][3] = {{0}}; /* of the node's matrix */
     out->vertex_count = at->count;
     out->triangle_count = index->count / 3;
     if (!make_room(out))
         return tl_fail_memory(error, binary->path);
-    for (size_t a = 0; a < 3; a++)
-        factor[a] = scale ? json_number_value(json_array_get(scale, a)) : 1;
+    for (size_t a = 0; a < 3; a++) {
+        column[a][a] = scale ? json_number_value(json_array_get(scale, a)) : 1;
+        column[3][a] = json_number_value(json_array_get(translation, a));
+        for (size_t c = 0; matrix && c < 4; c++)
+            column[c][a] = json_number_value(json_array_get(matrix, 4 * c + a));
+    }
     for (size_t k = 0; k < out->vertex_count; k++) {
         const unsigned char *from = at->at + k * at->stride;
-        double y_up[3];
-        for (size_t a = 0; a < 3; a++) {
-            double value = at->component == COMPONENT_U16 ? half_word_at(from + 2 * a) : float_at(from + 4 * a);
-            y_up[a] = value * factor[a] + json_number_value(json_array_get(translation, a));
+        double y_up[3] = {column[3][0], column[3][1], column[3][2]};
+        for (size_t c = 0; c < 3; c++) {
+            double value = at->component == COMPONENT_U16 ? half_word_at(from + 2 * c) : float_at(from + 4 * c);
+            for (size_t a = 0; a < 3; a++)
+                y_up[a] += value * column[c][a];
         }
         out->xyz[k][0] = y_up[0], out->xyz[k][1] = -y_up[2], out->xyz[k][2] = y_up[1];
     }

@@ -31,12 +31,16 @@ static tl_status write_vertices(const tl_mesh *mesh, out_frame *frame, const tl_
 {
     double xyz[BATCH][3];
     char line[128];
+    /* micrometres of geocentric coordinates are 13 digits */
+    bool wide = out_frame_kind(frame) == TL_FRAME_ECEF;
+    int level = wide ? 13 : 12, upright = wide ? 13 : 9;
     tl_status status = TL_OK;
     for (size_t k = 0; k < mesh->vertex_count && status == TL_OK; k += BATCH) {
         size_t n = mesh->vertex_count - k < BATCH ? mesh->vertex_count - k : BATCH;
         status = out_frame_apply(frame, mesh->vertices + k, n, xyz, error);
         for (size_t i = 0; i < n && status == TL_OK; i++) {
-            int length = snprintf(line, sizeof line, "v %.12g %.12g %.9g\n", xyz[i][0], xyz[i][1], xyz[i][2]);
+            int length = snprintf(line, sizeof line, "v %.*g %.*g %.*g\n", level, xyz[i][0], level, xyz[i][1], upright,
+                                  xyz[i][2]);
             status = tl_output_append(output, line, (size_t)length, error);
         }
         if (status == TL_OK)

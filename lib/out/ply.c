@@ -72,8 +72,8 @@ tl_status out_ply_write(const tl_mesh *mesh, tl_output *output, const tl_write_o
     if (!frame)
         return TL_ERROR_DATA;
     /* 24 bits hold a sample's column and row below 2^24, and metres of an ENU frame to 4 mm at 50 km; not a map's
-     * coordinates */
-    bool wide = out_frame_kind(frame) == TL_FRAME_PROJECTED;
+     * coordinates or those from the centre of the Earth */
+    bool wide = out_frame_kind(frame) == TL_FRAME_PROJECTED || out_frame_kind(frame) == TL_FRAME_ECEF;
     tl_status status = write_header(mesh, frame, wide ? "double" : "float", output, error);
     if (status == TL_OK)
         status = write_vertices(mesh, frame, wide, output, error);

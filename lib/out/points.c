@@ -213,7 +213,7 @@ tl_status out_points_geojson(const tl_framework *framework, const tl_source *dem
                         .lonlat = options->frame == TL_FRAME_DEFAULT,
                         .pixels = options->frame == TL_FRAME_PIXEL};
     (void)dem;
-    if (options->frame == TL_FRAME_ENU)
+    if (options->frame == TL_FRAME_ENU || options->frame == TL_FRAME_ECEF)
         return tl_fail(error, TL_ERROR_ARGUMENT, "%s: GeoJSON has no local frames; use the default, projected or pixel",
                        tl_output_path(output));
     if (self.lonlat && (!georef->crs || !georef->located))

@@ -5,8 +5,9 @@
 #include <math.h>
 #include <string.h>
 
-/* Half a unit in the last place, relative: of single precision, and of twelve and nine decimal digits. */
-static const double SINGLE = 0x1p-24, TWELVE = 5e-12, NINE = 5e-9;
+/* Half a unit in the last place, relative: of single precision, and of thirteen, twelve and nine decimal
+ * digits. */
+static const double SINGLE = 0x1p-24, THIRTEEN = 5e-13, TWELVE = 5e-12, NINE = 5e-9;
 
 static bool is_ending(const char *path, const char *ending)
 {
@@ -25,6 +26,17 @@ static tl_rounding in_space(const tl_source_info *grid, bool text)
     return (tl_rounding){.along = along / fmin(georef->cell_x, georef->cell_y),
                          .upright = upright * reach * reach / (2 * radius) / georef->height_unit,
                          .of_range = upright};
+}
+
+/* In each of three coordinates: thirteen digits of what no place of the Earth exceeds, or single precision of what the
+ * raster is long. */
+static tl_rounding from_centre(const tl_source_info *grid, bool single)
+{
+    const tl_georef *georef = &grid->georef;
+    double radius = georef->crs && georef->crs->semi_major > 0 ? georef->crs->semi_major : 6.378e6;
+    double reach = 1.5 * ((double)grid->width * georef->cell_x + (double)grid->height * georef->cell_y) + 1;
+    double off = sqrt(3.0) * (single ? SINGLE * reach : THIRTEEN * 1.01 * radius);
+    return (tl_rounding){.along = off / fmin(georef->cell_x, georef->cell_y), .upright = off / georef->height_unit};
 }
 
 /* A map's coordinates: whole in text, less than the raster is wide in single precision. */
@@ -71,6 +83,10 @@ tl_rounding tl_write_rounding(const tl_source_info *grid, const char *path, cons
     if (frame == TL_FRAME_DEFAULT)
         frame = grid->georef.crs && grid->georef.located ? TL_FRAME_ENU : TL_FRAME_PROJECTED;
     tl_rounding rounding = {0};
+    if (frame == TL_FRAME_ECEF && !glb) /* which is as in the tangent plane */
+        return from_centre(grid, is_ending(path, "stl"));
+    if (frame == TL_FRAME_ECEF)
+        frame = TL_FRAME_ENU;
     if (frame == TL_FRAME_ENU)
         rounding = in_space(grid, text);
     else if (frame == TL_FRAME_PROJECTED && !is_ending(path, "ply"))

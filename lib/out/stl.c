@@ -26,8 +26,9 @@ static void put_floats(unsigned char *to, const float *values, int count)
     }
 }
 
-/* A map's coordinates are too large for single precision: those of the first vertex, rounded, are taken off. */
-static tl_status place_vertices(const tl_mesh *mesh, out_frame *frame, float (*out)[3], double origin[2],
+/* A map's coordinates, and those from the centre of the Earth, are too large for single precision: those of the first
+ * vertex, rounded, are taken off. */
+static tl_status place_vertices(const tl_mesh *mesh, out_frame *frame, float (*out)[3], double origin[3],
                                 tl_error *error)
 {
     double xyz[BATCH][3];
@@ -36,17 +37,18 @@ static tl_status place_vertices(const tl_mesh *mesh, out_frame *frame, float (*o
         tl_status status = out_frame_apply(frame, mesh->vertices + k, n, xyz, error);
         if (status != TL_OK)
             return status;
-        for (int a = 0; a < 2 && !k && out_frame_kind(frame) == TL_FRAME_PROJECTED; a++)
+        int large = out_frame_kind(frame) == TL_FRAME_PROJECTED ? 2 : out_frame_kind(frame) == TL_FRAME_ECEF ? 3 : 0;
+        for (int a = 0; a < large && !k; a++)
             origin[a] = floor(xyz[0][a]);
         for (size_t i = 0; i < n; i++)
             for (int a = 0; a < 3; a++)
-                out[k + i][a] = (float)(xyz[i][a] - (a < 2 ? origin[a] : 0));
+                out[k + i][a] = (float)(xyz[i][a] - origin[a]);
     }
     return TL_OK;
 }
 
 /* A file that begins with "solid" is taken for text. */
-static tl_status write_header(const tl_mesh *mesh, const out_frame *frame, const double origin[2], tl_output *output,
+static tl_status write_header(const tl_mesh *mesh, const out_frame *frame, const double origin[3], tl_output *output,
                               tl_error *error)
 {
     unsigned char header[HEADER + 4] = {0};
@@ -57,6 +59,8 @@ static tl_status write_header(const tl_mesh *mesh, const out_frame *frame, const
         snprintf(text + used, sizeof text - (size_t)used, " at %.7f %.7f %.2f", o[0], o[1], o[2]);
     else if (out_frame_kind(frame) == TL_FRAME_PROJECTED)
         snprintf(text + used, sizeof text - (size_t)used, " from %.0f %.0f", origin[0], origin[1]);
+    else if (out_frame_kind(frame) == TL_FRAME_ECEF)
+        snprintf(text + used, sizeof text - (size_t)used, " from %.0f %.0f %.0f", origin[0], origin[1], origin[2]);
     memcpy(header, text, HEADER);
     put32(header + HEADER, (uint32_t)mesh->triangle_count);
     return tl_output_append(output, header, sizeof header, error);
@@ -104,7 +108,7 @@ tl_status out_stl_write(const tl_mesh *mesh, tl_output *output, const tl_write_o
     out_frame *frame = out_frame_create(mesh, options->frame, tl_output_path(output), error);
     if (!frame)
         return TL_ERROR_DATA;
-    double origin[2] = {0, 0};
+    double origin[3] = {0};
     float(*places)[3] = tl_alloc(mesh->vertex_count, sizeof *places);
     tl_status status =
         places ? place_vertices(mesh, frame, places, origin, error) : tl_fail_memory(error, tl_output_path(output));
