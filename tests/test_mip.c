@@ -120,25 +120,39 @@ static void levelsGoDownToOneSample(void **state)
     tl_source_destroy(source);
 }
 
-static void levelsKeepWithinTheMemoryGiven(void **state)
+/* The same from a file, where memory is short. */
+static void levelsGoToDiskBeyondTheMemoryGiven(void **state)
 {
     (void)state;
-    out_mip mip;
+    static float tile[256 * 256], read[256 * 256];
     tl_error error = {0};
-    const tl_run run = {.memory = 1 << 20};
-    assert_int_equal(out_mip_init(&mip, TL_MIP_BOX, 10000, 10000, &run, "large", &error), TL_ERROR_MEMORY);
-    assert_non_null(strstr(error.text, "large"));
-    assert_int_equal(out_mip_init(&mip, TL_MIP_BOX, 500, 500, &run, "small", &error), TL_OK);
-    out_mip_finish(&mip);
-    assert_int_equal(out_mip_init(&mip, TL_MIP_NONE, 10000, 10000, &run, "none", &error), TL_OK);
-    out_mip_finish(&mip);
+    char path[64];
+    snprintf(path, sizeof path, "mip-%ld", (long)getpid());
+    for (int small = 0; small < 2; small++) {
+        out_mip mip;
+        const tl_run run = {.memory = small ? 1 << 10 : 1 << 30};
+        assert_int_equal(out_mip_init(&mip, TL_MIP_LATTICE, 1, WIDTH, HEIGHT, &run, path, &error), TL_OK);
+        assert_int_equal(mip.spool != NULL, small);
+        for (int64_t y = 0; y < HEIGHT; y += 256)
+            for (int64_t x = 0; x < WIDTH; x += 256) {
+                tl_window w = {x, y, WIDTH - x < 256 ? WIDTH - x : 256, HEIGHT - y < 256 ? HEIGHT - y : 256};
+                for (int64_t k = 0; k < w.width * w.height; k++)
+                    tile[k] = height_at(x + k % w.width, y + k / w.width);
+                assert_int_equal(out_mip_add(&mip, 0, w, tile, &error), TL_OK);
+            }
+        assert_int_equal(out_mip_read(&mip, 1, (tl_window){256, 0, 45, 152}, read, &error), TL_OK);
+        for (int64_t k = 0; k < 45 * 152; k++)
+            assert_true(same(read[k], height_at(2 * (256 + k % 45), 2 * (k / 45))));
+        out_mip_finish(&mip);
+        assert_int_not_equal(access(path, F_OK), 0);
+    }
 }
 
 int main(void)
 {
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(levelsGoDownToOneSample),
-        cmocka_unit_test(levelsKeepWithinTheMemoryGiven),
+        cmocka_unit_test(levelsGoToDiskBeyondTheMemoryGiven),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }

@@ -158,6 +158,22 @@ tl_status tl_output_write_at(tl_output *output, const void *bytes, size_t count,
     return TL_OK;
 }
 
+tl_status tl_output_read_at(const tl_output *output, void *bytes, size_t count, uint64_t offset, tl_error *error)
+{
+    unsigned char *to = bytes;
+    while (count) {
+        ssize_t got = pread(output->descriptor, to, count, (off_t)offset);
+        if (got < 0 && errno == EINTR)
+            continue;
+        if (got <= 0)
+            return tl_fail_system(error, output->path, "read back", got < 0 ? errno : EIO);
+        to += got;
+        count -= (size_t)got;
+        offset += (uint64_t)got;
+    }
+    return TL_OK;
+}
+
 tl_status tl_output_flush(tl_output *output, tl_error *error)
 {
     tl_status status = tl_output_write_at(output, output->buffer, output->buffered, output->appended, error);

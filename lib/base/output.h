@@ -15,6 +15,8 @@ int tl_output_descriptor(const tl_output *output);
 const char *tl_output_path(const tl_output *output);
 /* Writes all bytes at `offset`, from any thread. */
 tl_status tl_output_write_at(tl_output *output, const void *bytes, size_t count, uint64_t offset, tl_error *error);
+/* Reads bytes that were written. */
+tl_status tl_output_read_at(const tl_output *output, void *bytes, size_t count, uint64_t offset, tl_error *error);
 /* Writes all bytes behind what tl_output_append wrote before (buffered; one thread). */
 tl_status tl_output_append(tl_output *output, const void *bytes, size_t count, tl_error *error);
 /* Writes what tl_output_append holds back, so that only the name is left to tl_output_commit. */

@@ -213,11 +213,7 @@ static tl_status read_tile(const writing *w, tl_window window, float *out, tl_er
         return w->planes->read(w->planes->context, window, out, error);
     if (w->level == 0)
         return tl_source_read(w->source, w->source->info.level, window, out, error);
-    const struct out_mip_level *level = &w->mip.levels[w->level];
-    for (int64_t y = 0; y < window.height; y++)
-        memcpy(out + y * window.width, level->heights + (window.y + y) * level->width + window.x,
-               (size_t)window.width * sizeof *out);
-    return TL_OK;
+    return out_mip_read(&w->mip, w->level, window, out, error);
 }
 
 static tl_status write_tile(void *context, tl_parallel *loop, uint64_t tile, unsigned index, tl_error *error)
@@ -229,7 +225,9 @@ static tl_status write_tile(void *context, tl_parallel *loop, uint64_t tile, uns
     if (status != TL_OK)
         return status;
     if (!w->planes->read)
-        out_mip_add(&w->mip, w->level, window, self->heights);
+        status = out_mip_add(&w->mip, w->level, window, self->heights, error);
+    if (status != TL_OK)
+        return status;
     out_extent_add(&self->extent, self->heights, (size_t)(window.width * window.height));
     self->loop = loop;
     self->tile = tile;
@@ -315,6 +313,14 @@ static tl_status patch_extent(tl_output *output, const out_extent *extent, tl_er
     return status;
 }
 
+static tl_status check_compression(tl_compression compression, const char *path, tl_error *error)
+{
+    if (compression < TL_COMPRESSION_DEFLATE)
+        return TL_OK;
+    return tl_fail(error, TL_ERROR_ARGUMENT,
+                   "%s: deflate, zstd, lzw and lerc are compressions of GeoTIFF; use zip, zips, piz or none", path);
+}
+
 static tl_status check_size(const tl_source_info *info, const char *path, tl_error *error)
 {
     /* the chunk table and the box of an EXR count in 32 bits */
@@ -331,6 +337,8 @@ static tl_status write_exr(const tl_source *source, const out_planes *planes, tl
 {
     const char *path = tl_output_path(output);
     tl_status status = check_size(&source->info, path, error);
+    if (status == TL_OK)
+        status = check_compression(options->compression, path, error);
     if (status != TL_OK)
         return status;
     tl_error own = {0};
@@ -340,7 +348,7 @@ static tl_status write_exr(const tl_source *source, const out_planes *planes, tl
     start.user_data = &to;
     start.write_fn = on_write;
     writing w = {.source = source, .planes = planes, .tiling = out_tiling_of(source), .to = &to};
-    status = out_mip_init(&w.mip, options->mip, source->info.width, source->info.height, options->run, path, error);
+    status = out_mip_init(&w.mip, options->mip, 1, source->info.width, source->info.height, options->run, path, error);
     if (status != TL_OK)
         return status;
     exr_result_t code = exr_start_write(&w.file, path, EXR_WRITE_FILE_DIRECTLY, &start);
