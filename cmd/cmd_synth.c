@@ -7,9 +7,11 @@
 #include <strings.h>
 #include <unistd.h>
 
-static const char *const compressions[] = {
-    [TL_COMPRESSION_DEFAULT] = "default", [TL_COMPRESSION_NONE] = "none", [TL_COMPRESSION_ZIP] = "zip",
-    [TL_COMPRESSION_ZIPS] = "zips",       [TL_COMPRESSION_PIZ] = "piz",   NULL};
+static const char *const compressions[] = {[TL_COMPRESSION_DEFAULT] = "default", [TL_COMPRESSION_NONE] = "none",
+                                           [TL_COMPRESSION_ZIP] = "zip",         [TL_COMPRESSION_ZIPS] = "zips",
+                                           [TL_COMPRESSION_PIZ] = "piz",         [TL_COMPRESSION_DEFLATE] = "deflate",
+                                           [TL_COMPRESSION_ZSTD] = "zstd",       [TL_COMPRESSION_LZW] = "lzw",
+                                           [TL_COMPRESSION_LERC] = "lerc",       NULL};
 static const char *const mips[] = {[TL_MIP_NONE] = "none", [TL_MIP_LATTICE] = "lattice", [TL_MIP_BOX] = "box", NULL};
 static const char *const supports[] = {
     [TL_SUPPORT_RASTER] = "raster", [TL_SUPPORT_AREA] = "area", [TL_SUPPORT_POINT] = "point", NULL};
@@ -29,6 +31,8 @@ typedef struct settings {
     int64_t tile;
     double quantum; /* step of the heights */
     bool quantum_given;
+    double lerc_error;
+    bool lerc_error_given, mip_given, cog;
     bool size_given, hurst_given, delta_given;
     double max_error; /* of the framework that the DEM is reduced to first */
     bool max_error_given, verify;
@@ -70,10 +74,13 @@ static tl_status write_samples(const settings *set, const tl_source *made, const
 {
     if (set->preset)
         return write_preset(set, made, run, error);
+    tl_mip usual = made->info.type == TL_RASTER_AREA ? TL_MIP_BOX : TL_MIP_LATTICE;
     const tl_write_options options = {.overwrite = set->common.overwrite,
+                                      .cog = set->cog,
+                                      .lerc_error = set->lerc_error,
                                       .validity = set->common.voids && strcmp(set->common.voids, "keep") != 0,
                                       .compression = (tl_compression)set->compression,
-                                      .mip = (tl_mip)set->mip,
+                                      .mip = set->cog && !set->mip_given ? usual : (tl_mip)set->mip,
                                       .frame = (tl_frame)set->frame,
                                       .run = run};
     return tl_write_grid(made, set->common.output, &options, error);
@@ -210,8 +217,8 @@ static bool grid_output_ok(const settings *set)
 {
     if (!layers_ok(set))
         return false;
-    if (set->preset && (set->mip || set->compression)) {
-        complain("--preset decides how files are written; leave --mip and --compression away");
+    if (set->preset && (set->mip || set->compression || set->cog)) {
+        complain("--preset decides how files are written; leave --mip, --compression and --cog away");
         return false;
     }
     if (set->tile && !set->preset) {
@@ -219,9 +226,15 @@ static bool grid_output_ok(const settings *set)
         return false;
     }
     const tl_format *format = tl_format_of(set->common.output);
-    if (!set->mip || (format && strcmp(format->ending, "exr") == 0))
+    bool exr = format && strcmp(format->ending, "exr") == 0, tif = format && strncmp(format->ending, "tif", 3) == 0;
+    if (set->mip && !exr && !tif)
+        complain("--mip: only .exr and .tif hold coarser levels, not %s; leave it out", set->common.output);
+    else if (set->cog && !tif)
+        complain("--cog: is an order of .tif, not of %s; leave it out", set->common.output);
+    else if (set->lerc_error_given && set->compression != TL_COMPRESSION_LERC)
+        complain("--lerc-error is for --compression lerc; give that too, or leave it away");
+    else
         return true;
-    complain("--mip: only .exr holds coarser levels, not %s; leave it out", set->common.output);
     return false;
 }
 
@@ -267,12 +280,16 @@ static const tl_source *open_ground(const settings *set, const arguments *inputs
         of->dem = of->opened.source;
         if (!of->dem || !set->max_error_given)
             return of->dem;
-        double bound = set->quantum_given ? set->max_error - set->quantum / 2 : set->max_error;
+        double moved = (set->quantum_given ? set->quantum / 2 : 0) + set->lerc_error;
+        double bound = set->max_error - moved;
         if (bound < 0) {
             *error = (tl_error){.status = TL_ERROR_ARGUMENT};
             snprintf(error->text, sizeof error->text,
-                     "--height-quantum %g alone moves heights by more than --max-error %g; take a smaller quantum",
-                     set->quantum, set->max_error);
+                     "%s alone %s heights by more than --max-error %g; take a smaller one",
+                     !set->lerc_error      ? "--height-quantum"
+                     : !set->quantum_given ? "--lerc-error"
+                                           : "--height-quantum and --lerc-error",
+                     set->lerc_error && set->quantum_given ? "move" : "moves", set->max_error);
             return NULL;
         }
         tl_framework_options options = {.max_error = bound, .frame = TL_FRAME_PIXEL, .run = run};
@@ -457,8 +474,28 @@ static void list_schemes(bool noise)
 /* What synth and noise write, and how. */
 #define GRID_OUTPUT(s)                                                                                                \
     COMMON_OUTPUT((s).common),                                                                                        \
-        {"compression", 0, OPTION_CHOICE, &(s).compression, NULL, "KIND", "of .exr and .tif (default: zip)", 0, 0,    \
+        {"compression",                                                                                               \
+         0,                                                                                                           \
+         OPTION_CHOICE,                                                                                               \
+         &(s).compression,                                                                                            \
+         NULL,                                                                                                        \
+         "KIND",                                                                                                      \
+         "of .exr: none, zip, zips or piz; of .tif: none, deflate, zstd, lzw or lerc (default: zip, deflate)",        \
+         0,                                                                                                           \
+         0,                                                                                                           \
          compressions},                                                                                               \
+        {"lerc-error",                                                                                                \
+         0,                                                                                                           \
+         OPTION_NUMBER,                                                                                               \
+         &(s).lerc_error,                                                                                             \
+         &(s).lerc_error_given,                                                                                       \
+         "E",                                                                                                         \
+         "by how much --compression lerc may move a height, in the DEM's unit, 1e-30...1e30 (default: not at all)",   \
+         1e-30,                                                                                                       \
+         1e30,                                                                                                        \
+         NULL},                                                                                                       \
+        {"cog", 0, OPTION_FLAG, &(s).cog, NULL, NULL, "a .tif in the order of cloud-optimised ones, with overviews",  \
+         0,     0, NULL},                                                                                             \
         {"height-quantum",                                                                                            \
          0,                                                                                                           \
          OPTION_NUMBER,                                                                                               \
@@ -491,8 +528,10 @@ static void list_schemes(bool noise)
          65536,                                                                                                       \
          NULL},                                                                                                       \
     {                                                                                                                 \
-        "mip", 0, OPTION_CHOICE, &(s).mip, NULL, "KIND",                                                              \
-            "coarser levels in an .exr, of every second sample or of means (default: none)", 0, 0, mips               \
+        "mip", 0, OPTION_CHOICE, &(s).mip, &(s).mip_given, "KIND",                                                    \
+            "coarser levels in an .exr or .tif, of every second sample or of means (default: none; with --cog: "      \
+            "lattice for points, box for areas)",                                                                     \
+            0, 0, mips                                                                                                \
     }
 
 static bool synth_ok(const settings *set)

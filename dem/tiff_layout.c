@@ -307,9 +307,20 @@ static int halvings_of(int64_t size, int64_t reduced)
     return 0;
 }
 
+/* Whether an overview says itself that its samples are no means, which levels of areas are. */
+static bool is_sampled(TIFF *tiff)
+{
+    char *metadata = dem_tiff_text(tiff, TAG_GDAL_METADATA);
+    const char *item = metadata ? strstr(metadata, "name=\"RESAMPLING\"") : NULL;
+    const char *value = item ? strchr(item, '>') : NULL;
+    bool sampled = value && strncmp(value + 1, "NEAREST", 7) == 0;
+    free(metadata);
+    return sampled;
+}
+
 static bool use_overview(dem_tiff_handle *handle, const dem_layout *main, dem_overview *out)
 {
-    if (dem_layout_read(handle, main->band + 1, &out->layout, NULL) != TL_OK)
+    if (is_sampled(handle->tiff) || dem_layout_read(handle, main->band + 1, &out->layout, NULL) != TL_OK)
         return false;
     out->halvings = halvings_of(main->width, out->layout.width);
     out->directory = TIFFCurrentDirOffset(handle->tiff);

@@ -975,6 +975,11 @@ typedef enum tl_compression {
     TL_COMPRESSION_ZIP,  /* EXR (16 rows at a time), and deflate for GeoTIFF */
     TL_COMPRESSION_ZIPS, /* EXR (row by row) */
     TL_COMPRESSION_PIZ,  /* EXR (wavelet) */
+    /* GeoTIFF, as far as libtiff was built with it */
+    TL_COMPRESSION_DEFLATE,
+    TL_COMPRESSION_ZSTD,
+    TL_COMPRESSION_LZW,
+    TL_COMPRESSION_LERC, /* of floats, within lerc_error */
 } tl_compression;
 
 /* Coarser levels beside a grid, in the same file. */
@@ -995,8 +1000,12 @@ typedef struct tl_write_options {
     bool overwrite; /* replace an existing file; else TL_ERROR_IO */
     bool validity;  /* of grids, not meshes: also write each sample's tl_validity, to NAME.validity.tif for NAME.exr */
     tl_compression compression;
-    tl_mip mip; /* EXR only: a mipmap down to one sample, its sizes rounded up. It is gathered in memory, a third of the
-                   grid */
+    /* EXR: a mipmap down to one sample; GeoTIFF: overviews down to one tile of 256 x 256. Sizes are rounded up. They
+     * take a third of the grid while it is written, of memory or, where the run may not take that, of disk. */
+    tl_mip mip;
+    bool cog; /* GeoTIFF: in the order of cloud-optimised ones, by a second file without a name beside the first */
+    /* TL_COMPRESSION_LERC: by how much a height may move, in the source's unit; 0: not at all. */
+    double lerc_error;
     tl_frame frame;
     tl_mesh_coding coding; /* of meshes in GLB; others keep theirs */
     /* GLB, of meshes that tl_mesh_parent_heights knows: also write these, as the attribute _PARENT_HEIGHT, and the ways

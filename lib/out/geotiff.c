@@ -1,10 +1,15 @@
-/* GeoTIFF: tiled, float32 with deflate and the floating-point predictor, or bytes of validity. libtiff keeps the
- * directory; tiles are predicted and compressed here, in parallel, and handed to it in order. */
+/* GeoTIFF: tiled, float32, or bytes of validity, with overviews on request. libtiff keeps the directories; tiles are
+ * predicted and compressed in parallel, and handed to it in order. A cloud-optimised file is put in its order at last.
+ */
 #include "dem/crs_ellipsoidal.h"
 #include "dem/crs_keys.h"
 #include "lib/base/error.h"
+#include "lib/base/number.h"
 #include "lib/base/parallel.h"
 #include "lib/base/size.h"
+#include "lib/out/cog.h"
+#include "lib/out/geotiff_pack.h"
+#include "lib/out/mip.h"
 #include "lib/out/out.h"
 
 #include <geotiff/geokeys.h>
@@ -12,7 +17,6 @@
 #include <geotiff/geotiffio.h>
 #include <geotiff/geovalues.h>
 #include <geotiff/xtiffio.h>
-#include <libdeflate.h>
 #include <tiffio.h>
 
 #include <errno.h>
@@ -24,16 +28,13 @@
 
 enum {
     TILE_BYTES = OUT_TILE * OUT_TILE * (int)sizeof(float),
-    DEFLATE_LEVEL = 6,
-    SPARSE_LEVEL = 9,      /* there is little to compress */
     GDAL_METADATA = 42112, /* GDAL's private tags */
     GDAL_NODATA = 42113,
     METADATA_LIMIT = 16384,
 };
 
-/* Above this many bytes of heights the file is a BigTIFF: a classic one ends at 2^32, and deflate may grow data a
- * little. */
-static const uint64_t classic_limit = UINT64_C(4000000000);
+/* Above this many bytes of tiles the file is a BigTIFF: a classic one ends at 2^32. */
+static const double classic_limit = 4e9;
 
 /* The first failure that libtiff told of. Its own words for a full disk are "Write error at scanline 4294967295", so
  * the system's reason, where there is one, goes before them: errno is set to 0 before each call that writes. */
@@ -109,7 +110,7 @@ static void append_item(char *to, size_t *used, const char *name, const char *va
         to[ *used = before] = '\0';
 }
 
-static bool set_metadata(TIFF *tiff, const tl_source_info *info)
+static bool set_metadata(TIFF *tiff, const tl_source_info *info, const out_packing *packing)
 {
     char *text = malloc(METADATA_LIMIT);
     if (!text)
@@ -117,6 +118,11 @@ static bool set_metadata(TIFF *tiff, const tl_source_info *info)
     size_t used = (size_t)snprintf(text, METADATA_LIMIT, "<GDALMetadata>\n");
     for (size_t i = 0; i < info->parameter_count && used + 1024 < METADATA_LIMIT; i++)
         append_item(text, &used, info->parameters[i].name, info->parameters[i].value);
+    if (packing->lerc_error > 0) {
+        char number[TL_NUMBER_TEXT];
+        tl_number_text(packing->lerc_error, number);
+        append_item(text, &used, "lerc_error", number);
+    }
     snprintf(text + used, METADATA_LIMIT - used, "</GDALMetadata>\n");
     bool good = TIFFSetField(tiff, GDAL_METADATA, text) == 1;
     free(text);
@@ -249,57 +255,61 @@ static bool set_transform(TIFF *tiff, const tl_source_info *info)
     return TIFFSetField(tiff, TIFFTAG_GEOTRANSMATRIX, 16, matrix) == 1;
 }
 
-static bool set_sample_format(TIFF *tiff, bool validity)
-{
-    return TIFFSetField(tiff, TIFFTAG_BITSPERSAMPLE, validity ? 8 : 32) == 1 &&
-           TIFFSetField(tiff, TIFFTAG_SAMPLEFORMAT, validity ? SAMPLEFORMAT_UINT : SAMPLEFORMAT_IEEEFP) == 1;
-}
-
-static bool set_bands(TIFF *tiff, size_t bands)
+static bool set_samples(TIFF *tiff, const out_packing *packing)
 {
     uint16_t other[OUT_BANDS] = {EXTRASAMPLE_UNSPECIFIED};
-    bool good = TIFFSetField(tiff, TIFFTAG_SAMPLESPERPIXEL, (int)bands) == 1 &&
-                TIFFSetField(tiff, TIFFTAG_PLANARCONFIG, PLANARCONFIG_CONTIG) == 1;
-    return good && (bands == 1 || TIFFSetField(tiff, TIFFTAG_EXTRASAMPLES, (int)bands - 1, other) == 1);
+    bool good =
+        TIFFSetField(tiff, TIFFTAG_BITSPERSAMPLE, packing->bytes ? 8 : 32) == 1 &&
+        TIFFSetField(tiff, TIFFTAG_SAMPLEFORMAT, packing->bytes ? SAMPLEFORMAT_UINT : SAMPLEFORMAT_IEEEFP) == 1 &&
+        TIFFSetField(tiff, TIFFTAG_SAMPLESPERPIXEL, (int)packing->bands) == 1 &&
+        TIFFSetField(tiff, TIFFTAG_PLANARCONFIG, PLANARCONFIG_CONTIG) == 1;
+    return good &&
+           (packing->bands == 1 || TIFFSetField(tiff, TIFFTAG_EXTRASAMPLES, (int)packing->bands - 1, other) == 1);
 }
 
-static bool set_directory(TIFF *tiff, const tl_source_info *info, bool compress, bool validity, size_t bands)
+static bool set_compression(TIFF *tiff, const out_packing *packing)
+{
+    bool good = TIFFSetField(tiff, TIFFTAG_COMPRESSION, out_packing_codec(packing)) == 1;
+    if (good && packing->compression == TL_COMPRESSION_LERC)
+        good = TIFFSetField(tiff, TIFFTAG_LERC_VERSION, LERC_VERSION_2_4) == 1 &&
+               TIFFSetField(tiff, TIFFTAG_LERC_ADD_COMPRESSION, LERC_ADD_COMPRESSION_NONE) == 1;
+    return good &&
+           (!out_packing_predicts(packing) || TIFFSetField(tiff, TIFFTAG_PREDICTOR, PREDICTOR_FLOATINGPOINT) == 1);
+}
+
+/* Says in GDAL's words that an overview's samples are not means. */
+static bool set_overview(TIFF *tiff, tl_mip kind)
+{
+    return TIFFSetField(tiff, TIFFTAG_SUBFILETYPE, FILETYPE_REDUCEDIMAGE) == 1 &&
+           TIFFSetField(tiff, GDAL_METADATA,
+                        kind == TL_MIP_BOX
+                            ? "<GDALMetadata><Item name=\"RESAMPLING\" sample=\"0\">AVERAGE</Item></GDALMetadata>"
+                            : "<GDALMetadata><Item name=\"RESAMPLING\" sample=\"0\">NEAREST</Item></GDALMetadata>") ==
+               1;
+}
+
+/* The directory of a level, 0 the finest. */
+static bool set_directory(TIFF *tiff, const tl_source_info *info, const out_packing *packing, const out_mip *mip,
+                          int level)
 {
     define_gdal_tags(tiff);
-    bool good = TIFFSetField(tiff, TIFFTAG_IMAGEWIDTH, (uint32_t)info->width) == 1 &&
-                TIFFSetField(tiff, TIFFTAG_IMAGELENGTH, (uint32_t)info->height) == 1 &&
+    bool good = TIFFSetField(tiff, TIFFTAG_IMAGEWIDTH, (uint32_t)mip->levels[level].width) == 1 &&
+                TIFFSetField(tiff, TIFFTAG_IMAGELENGTH, (uint32_t)mip->levels[level].height) == 1 &&
                 TIFFSetField(tiff, TIFFTAG_TILEWIDTH, OUT_TILE) == 1 &&
-                TIFFSetField(tiff, TIFFTAG_TILELENGTH, OUT_TILE) == 1 && set_bands(tiff, bands) &&
-                set_sample_format(tiff, validity) &&
-                TIFFSetField(tiff, TIFFTAG_PHOTOMETRIC, PHOTOMETRIC_MINISBLACK) == 1 &&
-                TIFFSetField(tiff, TIFFTAG_COMPRESSION, compress ? COMPRESSION_ADOBE_DEFLATE : COMPRESSION_NONE) == 1;
-    if (good && compress && !validity && bands == 1)
-        good = TIFFSetField(tiff, TIFFTAG_PREDICTOR, PREDICTOR_FLOATINGPOINT) == 1;
-    if (good && info->has_voids && !validity)
+                TIFFSetField(tiff, TIFFTAG_TILELENGTH, OUT_TILE) == 1 && set_samples(tiff, packing) &&
+                TIFFSetField(tiff, TIFFTAG_PHOTOMETRIC, PHOTOMETRIC_MINISBLACK) == 1 && set_compression(tiff, packing);
+    if (good && info->has_voids && !packing->bytes)
         good = TIFFSetField(tiff, GDAL_NODATA, "nan") == 1;
+    if (level)
+        return good && set_overview(tiff, mip->kind);
     if (good && info->georef.located)
         good = set_transform(tiff, info);
     good = good && set_keys(tiff, info); /* also without a place: the raster type is a key */
-    return good && (info->parameter_count == 0 || set_metadata(tiff, info));
+    bool record = info->parameter_count > 0 || packing->lerc_error > 0;
+    return good && (!record || set_metadata(tiff, info, packing));
 }
 
 /* ---- tiles ---- */
-
-/* TIFF's predictor 3: in each row the bytes of all samples by significance, highest first, then differences of
- * neighbours. (Adobe Photoshop TIFF Technical Note 3.) */
-static void predict_rows(const float *heights, unsigned char *out)
-{
-    for (int row = 0; row < OUT_TILE; row++, heights += OUT_TILE, out += OUT_TILE * sizeof(float)) {
-        for (int i = 0; i < OUT_TILE; i++) {
-            uint32_t bits;
-            memcpy(&bits, &heights[i], sizeof bits);
-            for (int byte = 0; byte < 4; byte++)
-                out[byte * OUT_TILE + i] = (unsigned char)(bits >> (24 - 8 * byte));
-        }
-        for (int i = OUT_TILE * (int)sizeof(float) - 1; i > 0; i--)
-            out[i] = (unsigned char)(out[i] - out[i - 1]);
-    }
-}
 
 /* Spreads the rows of a narrower window over a whole tile, the last column and row repeated: what compresses best. */
 static void pad_tile(unsigned char *samples, size_t size, tl_window window)
@@ -317,80 +327,37 @@ static void pad_tile(unsigned char *samples, size_t size, tl_window window)
 
 typedef struct worker {
     void *samples; /* floats, or bytes of validity */
-    unsigned char *predicted, *packed;
-    struct libdeflate_compressor *compressor;
+    out_packer *packer;
 } worker;
 
 typedef struct writing {
     const tl_source *const *bands;
-    size_t band_count; /* more than one: mostly void, so that empty tiles are left out and heights are not predicted */
-    const char *path;
+    out_packing packing; /* of several bands empty tiles are left out */
     TIFF *tiff;
-    out_tiling tiling;
-    bool compress, validity;
-    size_t packed_limit;
+    out_mip mip;
+    int level;
+    out_tiling tiling; /* of the level in hand */
     worker *workers;
     complaint said;
 } writing;
 
-static bool worker_init(worker *self, const writing *w)
-{
-    self->samples = malloc(w->band_count * TILE_BYTES);
-    self->predicted = w->compress || w->band_count > 1 ? malloc(w->band_count * TILE_BYTES) : NULL;
-    self->packed = w->compress ? malloc(w->packed_limit) : NULL;
-    self->compressor =
-        w->compress ? libdeflate_alloc_compressor(w->band_count > 1 ? SPARSE_LEVEL : DEFLATE_LEVEL) : NULL;
-    return self->samples && (!w->compress || (self->predicted && self->packed && self->compressor));
-}
-
-static void worker_finish(worker *self)
-{
-    free(self->samples);
-    free(self->predicted);
-    free(self->packed);
-    if (self->compressor)
-        libdeflate_free_compressor(self->compressor);
-}
-
 static tl_status read_tile(const writing *w, worker *self, tl_window window, tl_error *error)
 {
     int level = w->bands[0]->info.level;
+    size_t size = w->packing.bytes ? 1 : sizeof(float);
     tl_status status = TL_OK;
-    for (size_t k = 0; status == TL_OK && k < w->band_count; k++) {
+    for (size_t k = 0; status == TL_OK && k < w->packing.bands; k++) {
         unsigned char *to = (unsigned char *)self->samples + k * TILE_BYTES;
-        status = w->validity ? tl_source_validity(w->bands[k], level, window, to, error)
-                             : tl_source_read(w->bands[k], level, window, (float *)(void *)to, error);
+        float *heights = (float *)(void *)to;
+        status = w->level           ? out_mip_read(&w->mip, w->level, window, heights, error)
+                 : w->packing.bytes ? tl_source_validity(w->bands[k], level, window, to, error)
+                                    : tl_source_read(w->bands[k], level, window, heights, error);
         if (status == TL_OK)
-            pad_tile(to, w->validity ? 1 : sizeof(float), window);
+            status = out_mip_add(&w->mip, w->level, window, heights, error);
+        if (status == TL_OK)
+            pad_tile(to, size, window);
     }
     return status;
-}
-
-/* The bands beside each other, sample by sample: where few samples are known, their places are stored once. */
-static void interleave(const float *bands, size_t count, float *out)
-{
-    for (size_t i = 0; i < OUT_TILE * OUT_TILE; i++)
-        for (size_t k = 0; k < count; k++)
-            *out++ = bands[k * OUT_TILE * OUT_TILE + i];
-}
-
-/* The bytes that the file holds for the tile, and how many. */
-static const void *pack_tile(const writing *w, worker *self, size_t *count)
-{
-    const void *bytes = self->samples;
-    *count = w->validity ? OUT_TILE * OUT_TILE : w->band_count * TILE_BYTES;
-    if (w->band_count > 1) {
-        interleave(self->samples, w->band_count, (float *)(void *)self->predicted);
-        bytes = self->predicted;
-    }
-    if (!w->compress)
-        return bytes;
-    if (!w->validity && w->band_count == 1) {
-        predict_rows(self->samples, self->predicted);
-        bytes = self->predicted;
-    }
-    *count = libdeflate_zlib_compress(self->compressor, bytes, *count, self->packed, w->packed_limit);
-    return self->packed;
 }
 
 static bool is_empty(const float *heights, size_t count)
@@ -405,36 +372,62 @@ static tl_status write_tile(void *context, tl_parallel *loop, uint64_t tile, uns
 {
     writing *w = context;
     worker *self = &w->workers[index];
+    size_t count, bands = w->packing.bands;
+    const void *bytes;
     tl_status status = read_tile(w, self, out_tile_window(&w->tiling, tile), error);
+    bool left_out = status == TL_OK && bands > 1 && is_empty(self->samples, bands * OUT_TILE * OUT_TILE);
+    if (status == TL_OK)
+        status = out_packer_pack(self->packer, self->samples, &bytes, &count, error);
     if (status != TL_OK)
         return status;
-    size_t count;
-    bool left_out = w->band_count > 1 && is_empty(self->samples, w->band_count * OUT_TILE * OUT_TILE);
-    const void *bytes = pack_tile(w, self, &count);
     if (!tl_parallel_wait_turn(loop, tile))
         return tl_fail(error, TL_ERROR_CANCELLED, "interrupted");
     errno = 0;
     if (!left_out && TIFFWriteRawTile(w->tiff, (uint32_t)tile, (void *)bytes, (tmsize_t)count) != (tmsize_t)count)
-        return tiff_failed(w->path, &w->said, error);
+        return tiff_failed(w->packing.path, &w->said, error);
     tl_parallel_end_turn(loop, tile);
     return TL_OK;
 }
 
-static tl_status write_tiles(writing *w, const tl_run *run, tl_error *error)
+/* One level and its directory. */
+static tl_status write_level(writing *w, const tl_run *run, tl_error *error)
+{
+    int64_t width = w->mip.levels[w->level].width, height = w->mip.levels[w->level].height;
+    w->tiling = (out_tiling){tl_div_up(width, OUT_TILE), tl_div_up(height, OUT_TILE), width, height};
+    uint64_t tiles = (uint64_t)w->tiling.columns * (uint64_t)w->tiling.rows;
+    errno = 0;
+    if (!set_directory(w->tiff, &w->bands[0]->info, &w->packing, &w->mip, w->level))
+        return tiff_failed(w->packing.path, &w->said, error);
+    tl_status status = tl_parallel_for(run, tiles, (uint64_t)(width * height), write_tile, w, error);
+    errno = 0;
+    if (status == TL_OK && (!TIFFWriteDirectory(w->tiff) || w->said.made))
+        status = tiff_failed(w->packing.path, &w->said, error);
+    return status;
+}
+
+/* Level after level; the coarser ones are there when the finer ones are written. */
+static tl_status write_levels(writing *w, const tl_run *run, tl_error *error)
 {
     uint64_t tiles = (uint64_t)w->tiling.columns * (uint64_t)w->tiling.rows;
     unsigned count = tl_parallel_workers(run, tiles);
     tl_status status = TL_OK;
+    tl_run quiet = run ? *run : (tl_run){0};
+    quiet.progress = NULL; /* of the coarser levels, which are no work */
     w->workers = calloc(count, sizeof *w->workers);
     if (!w->workers)
-        return tl_fail_memory(error, w->path);
-    for (unsigned i = 0; i < count; i++)
-        if (!worker_init(&w->workers[i], w))
-            status = tl_fail_memory(error, w->path);
-    if (status == TL_OK)
-        status = tl_parallel_for(run, tiles, (uint64_t)(w->tiling.width * w->tiling.height), write_tile, w, error);
-    for (unsigned i = 0; i < count; i++)
-        worker_finish(&w->workers[i]);
+        return tl_fail_memory(error, w->packing.path);
+    for (unsigned i = 0; i < count; i++) {
+        w->workers[i].samples = malloc(w->packing.bands * TILE_BYTES);
+        w->workers[i].packer = out_packer_create(&w->packing);
+        if (!w->workers[i].samples || !w->workers[i].packer)
+            status = tl_fail_memory(error, w->packing.path);
+    }
+    for (w->level = 0; w->level < w->mip.count && status == TL_OK; w->level++)
+        status = write_level(w, w->level ? &quiet : run, error);
+    for (unsigned i = 0; i < count; i++) {
+        free(w->workers[i].samples);
+        out_packer_destroy(w->workers[i].packer);
+    }
     free(w->workers);
     return status;
 }
@@ -458,58 +451,95 @@ static TIFF *open_tiff(tl_output *output, bool big, complaint *said)
     return tiff;
 }
 
-static tl_status write_geotiff(const tl_source *const *bands, size_t band_count, bool validity, tl_output *output,
-                               const tl_write_options *options, tl_error *error)
+/* Bytes that the tiles may take at most. LZW's codes have up to 12 bits for each byte. */
+static double most_bytes(const writing *w)
+{
+    const tl_source_info *info = &w->bands[0]->info;
+    double samples = (double)info->width * (double)info->height * (double)w->packing.bands;
+    return samples * sizeof(float) * (w->mip.count > 1 ? 4 / 3.0 : 1) *
+           (w->packing.compression == TL_COMPRESSION_LZW ? 1.5 : 1);
+}
+
+/* All levels as a TIFF whose directories stand behind their tiles. */
+static tl_status write_tiff(writing *w, tl_output *output, bool big, const tl_run *run, tl_error *error)
+{
+    XTIFFInitialize();
+    w->tiff = open_tiff(output, big, &w->said);
+    if (!w->tiff)
+        return tiff_failed(w->packing.path, &w->said, error);
+    tl_status status = write_levels(w, run, error);
+    /* TIFFClose would write what is left, and cannot fail */
+    errno = 0;
+    XTIFFClose(w->tiff);
+    if (status == TL_OK && w->said.made)
+        status = tiff_failed(w->packing.path, &w->said, error);
+    return status;
+}
+
+/* The same in another order, by a file that gets no name. */
+static tl_status write_cog(writing *w, tl_output *output, const tl_run *run, tl_error *error)
+{
+    tl_output *spool = tl_output_open(w->packing.path, true, error);
+    tl_status status = spool ? write_tiff(w, spool, true, run, error) : TL_ERROR_IO;
+    if (status == TL_OK)
+        status = out_cog_write(spool, output, run, error);
+    tl_output_abort(spool);
+    return status;
+}
+
+static tl_status check_size(const tl_source_info *info, const char *path, tl_error *error)
+{
+    int64_t samples;
+    if (info->width <= INT32_MAX && info->height <= INT32_MAX && tl_int64_mul(info->width, info->height, &samples) &&
+        tl_div_up(info->width, OUT_TILE) * tl_div_up(info->height, OUT_TILE) <= INT32_MAX)
+        return TL_OK;
+    return tl_fail(error, TL_ERROR_ARGUMENT, "%s: %lld x %lld samples are too many for a TIFF; refine by fewer levels",
+                   path, (long long)info->width, (long long)info->height);
+}
+
+/* Overviews stop where one tile holds all. */
+static tl_status write_geotiff(const tl_source *const *bands, const out_packing *packing, tl_mip mip, bool cog,
+                               tl_output *output, const tl_run *run, tl_error *error)
 {
     const tl_source_info *info = &bands[0]->info;
-    writing w = {.bands = bands,
-                 .band_count = band_count,
-                 .validity = validity,
-                 .path = tl_output_path(output),
-                 .tiling = out_tiling_of(bands[0])};
-    int64_t samples;
-    if (info->width > INT32_MAX || info->height > INT32_MAX || !tl_int64_mul(info->width, info->height, &samples) ||
-        w.tiling.columns * w.tiling.rows > INT32_MAX)
-        return tl_fail(error, TL_ERROR_ARGUMENT,
-                       "%s: %lld x %lld samples are too many for a TIFF; refine by fewer levels", w.path,
-                       (long long)info->width, (long long)info->height);
-    w.compress = options->compression != TL_COMPRESSION_NONE;
-    w.packed_limit = libdeflate_zlib_compress_bound(NULL, band_count * TILE_BYTES);
-    XTIFFInitialize();
-    w.tiff = open_tiff(output, band_count * (uint64_t)samples * sizeof(float) > classic_limit, &w.said);
-    if (!w.tiff)
-        return tiff_failed(w.path, &w.said, error);
-    errno = 0;
-    tl_status status = set_directory(w.tiff, info, w.compress, validity, band_count)
-                           ? write_tiles(&w, options->run, error)
-                           : tiff_failed(w.path, &w.said, error);
-    /* TIFFClose cannot fail, so what it would do is done here */
-    errno = 0;
-    if (status == TL_OK && (!TIFFWriteDirectory(w.tiff) || w.said.made))
-        status = tiff_failed(w.path, &w.said, error);
-    XTIFFClose(w.tiff);
-    if (status == TL_OK && w.said.made)
-        status = tiff_failed(w.path, &w.said, error);
+    writing w = {.bands = bands, .packing = *packing, .tiling = out_tiling_of(bands[0])};
+    tl_status status = check_size(info, packing->path, error);
+    if (status == TL_OK)
+        status = out_packing_check(packing, error);
+    if (status == TL_OK)
+        status = out_mip_init(&w.mip, mip, OUT_TILE, info->width, info->height, run, packing->path, error);
+    if (status != TL_OK)
+        return status;
+    status =
+        cog ? write_cog(&w, output, run, error) : write_tiff(&w, output, most_bytes(&w) > classic_limit, run, error);
+    out_mip_finish(&w.mip);
     return status;
 }
 
 tl_status out_geotiff_write(const tl_source *source, tl_output *output, const tl_write_options *options,
                             tl_error *error)
 {
-    if (options->compression == TL_COMPRESSION_PIZ || options->compression == TL_COMPRESSION_ZIPS)
-        return tl_fail(error, TL_ERROR_ARGUMENT, "%s: piz and zips are compressions of EXR; use zip or none",
-                       tl_output_path(output));
-    return write_geotiff(&source, 1, false, output, options, error);
+    const out_packing packing = {.path = tl_output_path(output),
+                                 .compression = options->compression,
+                                 .bands = 1,
+                                 .lerc_error = options->lerc_error};
+    return write_geotiff(&source, &packing, options->mip, options->cog, output, options->run, error);
 }
 
 tl_status out_validity_write(const tl_source *source, tl_output *output, const tl_write_options *options,
                              tl_error *error)
 {
-    return write_geotiff(&source, 1, true, output, options, error);
+    const out_packing packing = {.path = tl_output_path(output),
+                                 .compression = options->compression == TL_COMPRESSION_NONE ? TL_COMPRESSION_NONE
+                                                                                            : TL_COMPRESSION_DEFLATE,
+                                 .bytes = true,
+                                 .bands = 1};
+    return write_geotiff(&source, &packing, TL_MIP_NONE, false, output, options->run, error);
 }
 
 tl_status out_geotiff_write_bands(const tl_source *const *bands, size_t count, tl_output *output,
                                   const tl_write_options *options, tl_error *error)
 {
-    return write_geotiff(bands, count, false, output, options, error);
+    const out_packing packing = {.path = tl_output_path(output), .compression = options->compression, .bands = count};
+    return write_geotiff(bands, &packing, TL_MIP_NONE, false, output, options->run, error);
 }
