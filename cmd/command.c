@@ -13,12 +13,9 @@
 const char *const progress_names[] = {
     [PROGRESS_BAR] = "bar", [PROGRESS_JSON] = "json", [PROGRESS_NONE] = "none", [PROGRESS_NONE + 1] = NULL};
 
-const char *const frame_names[] = {[TL_FRAME_DEFAULT] = "default",
-                                   [TL_FRAME_ENU] = "enu",
-                                   [TL_FRAME_PROJECTED] = "projected",
-                                   [TL_FRAME_PIXEL] = "pixel",
-                                   [TL_FRAME_ECEF] = "ecef",
-                                   NULL};
+const char *const frame_names[] = {
+    [TL_FRAME_DEFAULT] = "default", [TL_FRAME_ENU] = "enu",   [TL_FRAME_PROJECTED] = "projected",
+    [TL_FRAME_PIXEL] = "pixel",     [TL_FRAME_ECEF] = "ecef", NULL};
 
 static void print_help(const command *self, const option_group *groups)
 {

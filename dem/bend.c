@@ -15,7 +15,8 @@ struct dem_space {
 
 bool dem_frame_bends(const tl_georef *georef, tl_frame frame)
 {
-    return (frame == TL_FRAME_DEFAULT || frame == TL_FRAME_ENU || frame == TL_FRAME_ECEF) && georef->crs && georef->located;
+    return (frame == TL_FRAME_DEFAULT || frame == TL_FRAME_ENU || frame == TL_FRAME_ECEF) && georef->crs &&
+           georef->located;
 }
 
 static void lonlat(const dem_space *space, double i, double j, double *longitude, double *latitude)
