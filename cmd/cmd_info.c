@@ -1,4 +1,5 @@
 #include "cmd/command.h"
+#include "cmd/mesh_info.h"
 
 #include <jansson.h>
 #include <math.h>
@@ -404,12 +405,15 @@ static int run(const command *self, int argc, const char **argv, bool help)
     int status;
     if (!command_begin(self, argc, argv, help, groups, -1, &rest, &status))
         return status;
-    if (!set.common.memory)
+    bool mesh = rest.count == 1 && mesh_info_is_for(rest.names[0]);
+    if (!set.common.memory && !mesh)
         set.common.memory = MEMORY; /* each block is looked at once or twice, one after the other */
-    status = inform(&set, &rest);
+    status = mesh ? mesh_info_print(rest.names[0], set.json, &set.common) : inform(&set, &rest);
     arguments_free(&rest);
     return status;
 }
 
-const command command_info = {"info", "tell what a raster holds", "RASTER... [--json]",
-                              INPUT_NOTES "\n\nWithout --memory, info takes 64 MB.", run};
+const command command_info = {"info", "tell what a raster or a mesh holds", "RASTER...|MESH [--json]",
+                              INPUT_NOTES "\n\nWithout --memory, info of a raster takes 64 MB. Meshes are .glb, "
+                                          ".obj, .ply and .stl as talus writes them.",
+                              run};

@@ -1,4 +1,5 @@
 #include "cmd/command.h"
+#include "cmd/same_as.h"
 
 #include <math.h>
 #include <stdio.h>
@@ -37,6 +38,8 @@ typedef struct settings {
     double max_error; /* of the framework that the DEM is reduced to first */
     bool max_error_given, verify;
     const char *hurst_map, *delta_map, *sigma_map;
+    const char *same_as; /* an output to be made again */
+    const char *record;  /* of the command line */
 } settings;
 
 static void report(const settings *set, const tl_source *made, double seconds)
@@ -86,12 +89,22 @@ static tl_status write_samples(const settings *set, const tl_source *made, const
     return tl_write_grid(made, set->common.output, &options, error);
 }
 
+/* With the command line in the record, from which --same-as makes it again. */
+static tl_status write_recorded(const settings *set, const tl_source *heights, const tl_run *run, tl_error *error)
+{
+    const tl_parameter line = {"command", set->record};
+    tl_source *made = tl_recorded_create(heights, &line, set->record ? 1 : 0, error);
+    tl_status status = made ? write_samples(set, made, run, error) : TL_ERROR_MEMORY;
+    tl_source_destroy(made);
+    return status;
+}
+
 static tl_status write_grid(const settings *set, const tl_source *made, const tl_run *run, tl_error *error)
 {
     if (!set->quantum_given)
-        return write_samples(set, made, run, error);
+        return write_recorded(set, made, run, error);
     tl_source *steps = tl_quantized_create(made, set->quantum, error);
-    tl_status status = steps ? write_samples(set, steps, run, error) : TL_ERROR_MEMORY;
+    tl_status status = steps ? write_recorded(set, steps, run, error) : TL_ERROR_MEMORY;
     tl_source_destroy(steps);
     return status;
 }
@@ -527,6 +540,16 @@ static void list_schemes(bool noise)
          1,                                                                                                           \
          65536,                                                                                                       \
          NULL},                                                                                                       \
+        {"same-as",                                                                                                   \
+         0,                                                                                                           \
+         OPTION_TEXT,                                                                                                 \
+         &(s).same_as,                                                                                                \
+         NULL,                                                                                                        \
+         "FILE",                                                                                                      \
+         "make this output again: the options that are recorded in it, with those given here over them",              \
+         0,                                                                                                           \
+         0,                                                                                                           \
+         NULL},                                                                                                       \
     {                                                                                                                 \
         "mip", 0, OPTION_CHOICE, &(s).mip, &(s).mip_given, "KIND",                                                    \
             "coarser levels in an .exr or .tif, of every second sample or of means (default: none; with --cog: "      \
@@ -546,6 +569,15 @@ static bool synth_ok(const settings *set)
         complain("--verify measures against --max-error E; give that too");
         good = false;
     }
+    return good;
+}
+
+/* The options of --same-as's file, where it is given, with the command line's over them. */
+static bool take_record(const command *self, int argc, const char **argv, const option_group *groups, settings *set,
+                        arguments *rest)
+{
+    bool good = !set->same_as || same_as_parse(self, set->same_as, argc, argv, groups, rest);
+    set->record = rest->record;
     return good;
 }
 
@@ -597,15 +629,21 @@ static int run_synth(const command *self, int argc, const char **argv, bool help
     const option_group groups[] = {{"Detail", detail}, {"Input", input}, {"Output", output}, {"Running", running}, {0}};
     arguments rest;
     int status;
-    if (!command_begin(self, argc, argv, help, groups, -1, &rest, &status)) {
+    if (!command_begin(self, argc, argv, help, groups, ANY_INPUTS, &rest, &status)) {
         if (help || status == EXIT_DONE)
             list_schemes(false);
         return status;
+    }
+    if (!take_record(self, argc, argv, groups, &set, &rest) || (!rest.count && !command_misses_input(self))) {
+        arguments_free(&rest);
+        return EXIT_USAGE;
     }
     set.field.levels = (int)set.levels;
     set.field.seed = (uint64_t)set.seed;
     set.field.support = (tl_support)set.support;
     status = synth_ok(&set) ? synth(&set, &rest) : EXIT_USAGE;
+    if (status == EXIT_DONE && set.same_as)
+        status = same_as_compare(set.same_as, &set.common, &rest);
     arguments_free(&rest);
     return status;
 }
@@ -657,10 +695,16 @@ static int run_noise(const command *self, int argc, const char **argv, bool help
             list_schemes(true);
         return status;
     }
+    if (!take_record(self, argc, argv, groups, &set, &rest)) {
+        arguments_free(&rest);
+        return EXIT_USAGE;
+    }
     set.noise.seed = (uint64_t)set.seed;
     bool good = (!set.noise.scheme || names_scheme(set.noise.scheme, true)) &&
                 command_output_ok(&set.common, true, true) && grid_output_ok(&set);
     status = good ? noise(&set) : EXIT_USAGE;
+    if (status == EXIT_DONE && set.same_as)
+        status = same_as_compare(set.same_as, &set.common, &rest);
     arguments_free(&rest);
     return status;
 }

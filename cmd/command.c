@@ -25,6 +25,18 @@ static void print_help(const command *self, const option_group *groups)
         printf("\n%s\n", self->notes);
 }
 
+static void print_usage(const command *self)
+{
+    fprintf(stderr, "Usage: talus %s %s\n'talus help %s' tells more.\n", self->name, self->arguments, self->name);
+}
+
+bool command_misses_input(const command *self)
+{
+    complain("an input file is missing");
+    print_usage(self);
+    return false;
+}
+
 bool command_begin(const command *self, int argc, const char **argv, bool help, const option_group *groups, int inputs,
                    arguments *rest, int *status)
 {
@@ -36,7 +48,10 @@ bool command_begin(const command *self, int argc, const char **argv, bool help, 
         *status = command_done();
         return false;
     }
-    size_t least = inputs < 0 ? 1 : (size_t)inputs, most = inputs < 0 ? SIZE_MAX : (size_t)inputs;
+    size_t least = inputs == ANY_INPUTS ? 0
+                   : inputs < 0         ? 1
+                                        : (size_t)inputs,
+           most = inputs < 0 ? SIZE_MAX : (size_t)inputs;
     if (result == PARSE_OK && (rest->count < least || rest->count > most)) {
         if (rest->count > most)
             complain("'%s' is one argument too many; the output goes behind -o", rest->names[inputs]);
@@ -50,7 +65,7 @@ bool command_begin(const command *self, int argc, const char **argv, bool help, 
             result = PARSE_BAD;
         }
     if (result == PARSE_BAD) {
-        fprintf(stderr, "Usage: talus %s %s\n'talus help %s' tells more.\n", self->name, self->arguments, self->name);
+        print_usage(self);
         arguments_free(rest);
         *status = EXIT_USAGE;
         return false;

@@ -140,10 +140,15 @@ typedef struct common {
 
 extern const char *const progress_names[], *const frame_names[]; /* by progress_style and tl_frame, ended by NULL */
 
+enum { ANY_INPUTS = -2 };
+
 /* Parses the command's options and checks that `inputs` file names stand beside them (-1: one or more). False: the
  * caller ends with *status. */
 bool command_begin(const command *self, int argc, const char **argv, bool help, const option_group *groups, int inputs,
                    arguments *rest, int *status);
+
+/* "An input file is missing" and the usage; false. */
+bool command_misses_input(const command *self);
 
 /* The tl_run of a command; reports to *bar. */
 tl_run command_run(const common *options, progress *bar);
@@ -160,10 +165,11 @@ typedef struct opened_input {
 opened_input command_open(const common *options, const arguments *inputs, const tl_run *run, tl_error *error);
 void command_close(opened_input *opened);
 /* What COMMAND's help says of its inputs. */
-#define INPUT_NOTES                                                                                                 \
-    "Inputs are GeoTIFFs, SRTM .hgt files, directories of them, patterns or @LIST (a file of names); several make " \
-    "one\n"                                                                                                         \
-    "elevation model, in which the finest wins where they overlap, then the first. Or one EXR that talus wrote."
+#define INPUT_NOTES                                                                                                  \
+    "Inputs are GeoTIFFs, SRTM .hgt files, directories of them, patterns or @LIST (a file of names); several make "  \
+    "one\n"                                                                                                          \
+    "elevation model, in which the finest wins where they overlap, then the first. Or one .exr, .png, .r16 or .raw " \
+    "that talus wrote."
 /* Tells the error on stderr; the exit status that it means. */
 int command_failed(progress *bar, const tl_error *error);
 /* A line on stderr, unless quiet. */

@@ -1,5 +1,7 @@
 #include "cmd/options.h"
 
+#include "cmd/record.h"
+
 #include <errno.h>
 #include <math.h>
 #include <popt.h>
@@ -250,6 +252,17 @@ static bool collect_names(poptContext context, arguments *rest)
     return true;
 }
 
+void options_undo(const option_group *groups, const arguments *rest)
+{
+    const option *flat[MAX_OPTIONS];
+    size_t count = flatten(groups, flat);
+    for (size_t k = 0; rest->before && k < count; k++) {
+        memcpy(flat[k]->target, &rest->before[k], record_value_size(flat[k]));
+        if (flat[k]->given)
+            *flat[k]->given = false;
+    }
+}
+
 void arguments_free(arguments *rest)
 {
     for (size_t i = 0; i < rest->count; i++)
@@ -258,6 +271,8 @@ void arguments_free(arguments *rest)
         free(rest->texts[i]);
     free(rest->names);
     free(rest->texts);
+    free(rest->record);
+    free(rest->before);
     *rest = (arguments){0};
 }
 
@@ -281,8 +296,13 @@ parse_result options_parse(const char *command, int argc, const char **argv, con
     struct poptOption table[MAX_OPTIONS + 2];
     fill_table(table, flat, count);
     size_t words = (size_t)argc + 1; /* each word is one name or one text at most */
-    *rest = (arguments){.names = calloc(words, sizeof *rest->names), .texts = calloc(words, sizeof *rest->texts)};
-    poptContext context = rest->names && rest->texts ? poptGetContext(command, argc, argv, table, 0) : NULL;
+    *rest = (arguments){.names = calloc(words, sizeof *rest->names),
+                        .texts = calloc(words, sizeof *rest->texts),
+                        .before = calloc(count + 1, sizeof *rest->before)};
+    if (rest->before)
+        record_values(flat, count, rest->before);
+    poptContext context =
+        rest->names && rest->texts && rest->before ? poptGetContext(command, argc, argv, table, 0) : NULL;
     parse_result result = context ? run_popt(context, flat, count, rest) : PARSE_BAD;
     if (!context || (result == PARSE_OK && !collect_names(context, rest))) {
         complain("not enough memory");
@@ -290,6 +310,8 @@ parse_result options_parse(const char *command, int argc, const char **argv, con
     }
     if (context)
         poptFreeContext(context);
+    if (result == PARSE_OK)
+        rest->record = record_make(command, flat, count, rest->before, rest);
     return result;
 }
 

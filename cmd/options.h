@@ -44,6 +44,8 @@ typedef struct arguments {
     size_t count;
     char **texts;
     size_t text_count;
+    char *record;               /* the command line again, as record.h has it; NULL: not built */
+    union option_value *before; /* what the targets held, in the order of the options */
 } arguments;
 
 typedef enum parse_result { PARSE_OK, PARSE_HELP, PARSE_BAD } parse_result;
@@ -52,6 +54,9 @@ typedef enum parse_result { PARSE_OK, PARSE_HELP, PARSE_BAD } parse_result;
  * name. Whatever the result, the caller frees *rest, after the last use of the options. */
 parse_result options_parse(const char *command, int argc, const char **argv, const option_group *groups,
                            arguments *rest);
+
+/* Gives the targets back what they held before they were parsed into *rest. */
+void options_undo(const option_group *groups, const arguments *rest);
 
 void arguments_free(arguments *rest);
 

@@ -4,6 +4,7 @@
 #include "dem/geokeys.h"
 #include "dem/levels.h"
 #include "dem/tiff_blocks.h"
+#include "dem/tiff_record.h"
 #include "lib/base/error.h"
 #include "lib/base/size.h"
 
@@ -21,6 +22,7 @@ typedef struct dem_source {
     unsigned usable;         /* those that stand for levels */
     dem_overview *overviews;
     dem_blocks **overview_blocks;
+    tl_parameter *parameters;
 } dem_source;
 
 static tl_status read_blocks(const void *blocks, tl_window window, float *out, tl_error *error)
@@ -69,6 +71,7 @@ static void dem_destroy(tl_source *self)
     dem_tiff_file_destroy(dem->tiff);
     dem_file_close(dem->file);
     tl_crs_release(dem->crs);
+    free(dem->parameters);
     free(dem);
 }
 
@@ -161,6 +164,9 @@ static tl_status read_directory(dem_source *dem, dem_tiff_handle *handle, const 
     info->block_width = dem->layout.block_width;
     info->block_height = dem->layout.block_height;
     status = read_georef(dem, handle->tiff, sharing->crs, error);
+    if (status == TL_OK)
+        status = dem_record_read(handle->tiff, info->name, &dem->parameters, &info->parameter_count, error);
+    info->parameters = dem->parameters;
     return status == TL_OK ? prepare_blocks(dem, sharing->cache, options, error) : status;
 }
 

@@ -185,14 +185,17 @@ TL_API tl_status tl_source_bounds(const tl_source_info *info, double bounds[4], 
  * all that `info` points to). info->level must be 0. */
 TL_API tl_source *tl_array_source_create(const float *heights, const tl_source_info *info, tl_error *error);
 
-/* Opens a raster that talus can read: an EXR heightfield that talus wrote, by its content, or whatever tl_dem_open
- * takes.
- */
+/* Opens a raster that talus can read: an EXR heightfield that talus wrote, by its content; a .png, .r16 or .raw that it
+ * wrote, with the JSON file beside it; or whatever tl_dem_open takes. A record of how talus made it is in its
+ * parameters. */
 TL_API tl_source *tl_open(const char *path, tl_error *error);
 
 /* Heights rounded to multiples of `quantum` (units of height, above 0): a field in steps of 1/64 m takes half the room
  * in a compressed file. No height moves by more than half of it. */
 TL_API tl_source *tl_quantized_create(const tl_source *source, double quantum, tl_error *error);
+
+/* The same source with `count` more parameters in its record (both strings are copied). */
+TL_API tl_source *tl_recorded_create(const tl_source *source, const tl_parameter *more, size_t count, tl_error *error);
 
 /* ---- Elevation models -------------------------------------------------------------------------- */
 
@@ -1034,6 +1037,19 @@ TL_API tl_rounding tl_write_rounding(const tl_source_info *grid, const char *pat
 TL_API tl_status tl_mesh_verify_file(const char *path, const tl_mesh *mesh, const tl_source *source,
                                      const tl_selection *bounds, tl_frame frame, const tl_run *run, tl_mesh_report *out,
                                      tl_error *error);
+/* What a mesh file holds. */
+typedef struct tl_mesh_summary {
+    size_t vertex_count, triangle_count;
+    double low[3], high[3]; /* of the coordinates, in the axes of the frame (a GLB's turned back) */
+    /* "frame", "origin", "crs" where the file tells, then how the mesh was made; one block that free() frees, NULL for
+     * none. */
+    tl_parameter *record;
+    size_t record_count;
+} tl_mesh_summary;
+
+/* Reads a .glb, .obj, .ply or .stl that talus wrote, in memory. TL_ERROR_DATA where it is damaged, or of a kind that
+ * talus would not write; TL_ERROR_MEMORY where it takes more than run->memory. */
+TL_API tl_status tl_mesh_read_summary(const char *path, const tl_run *run, tl_mesh_summary *out, tl_error *error);
 /* Writes an error pyramid to `path` as a GeoTIFF of bytes, or of floats where it is exact. */
 TL_API tl_status tl_pyramid_save(const tl_pyramid *pyramid, const char *path, const tl_write_options *options,
                                  tl_error *error);

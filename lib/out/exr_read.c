@@ -1,10 +1,9 @@
 /* EXR heightfields that talus wrote, as sources. */
-#include "dem/crs.h"
-#include "dem/crs_keys.h"
 #include "lib/base/error.h"
-#include "lib/base/number.h"
+#include "lib/base/georef.h"
 #include "lib/base/size.h"
 #include "lib/out/out.h"
+#include "lib/out/place.h"
 
 #include <openexr.h>
 
@@ -175,34 +174,19 @@ static bool is_ours(exr_source *self)
 static tl_status read_georeference(exr_source *self, tl_error *error)
 {
     tl_source_info *info = &self->source.info;
-    info->georef = tl_georef_none();
-    const char *type = text_attribute(self->file, "gdal:AREA_OR_POINT"),
-               *wkt = text_attribute(self->file, "gdal:crsWkt");
+    const char *type = text_attribute(self->file, "gdal:AREA_OR_POINT");
     info->type = type && strcmp(type, "Point") == 0 ? TL_RASTER_POINT : TL_RASTER_AREA;
+    out_place place = {.wkt = text_attribute(self->file, "gdal:crsWkt"),
+                       .keys = text_attribute(self->file, "geotiff:keys")};
     exr_attr_m33d_t m;
+    double transform[6];
     if (exr_attr_get_m33d(self->file, PART, "gdal:geoTransform", &m) == EXR_ERR_SUCCESS) {
-        double t[6] = {m.m[2], m.m[0], m.m[1], m.m[5], m.m[3], m.m[4]};
-        t[0] += 0.5 * (t[1] + t[2]); /* from the corner of the first cell to its middle */
-        t[3] += 0.5 * (t[4] + t[5]);
-        info->georef.located = tl_transform_is_usable(t);
-        if (info->georef.located)
-            memcpy(info->georef.transform, t, sizeof t);
+        const double t[6] = {m.m[2], m.m[0], m.m[1], m.m[5], m.m[3], m.m[4]};
+        memcpy(transform, t, sizeof t);
+        place.transform = transform;
     }
-    double unit;
-    if (exr_attr_get_double(self->file, PART, "talus:heightUnit", &unit) == EXR_ERR_SUCCESS && unit > 0 &&
-        isfinite(unit))
-        info->georef.height_unit = unit;
-    tl_crs *crs = NULL;
-    /* a CRS that cannot be made out leaves the heights readable, as in a GeoTIFF */
-    if (wkt && dem_crs_from_text(wkt, self->path, &crs, error) == TL_ERROR_MEMORY)
-        return TL_ERROR_MEMORY;
-    info->georef.crs = crs;
-    const char *keys = crs ? text_attribute(self->file, "geotiff:keys") : NULL;
-    if (keys && dem_crs_take_keys(crs, keys, self->path, error) != TL_OK)
-        return TL_ERROR_MEMORY;
-    tl_status status = dem_georef_measure(&info->georef, info->width, info->height, error);
-    info->wraps = status == TL_OK && dem_georef_goes_around(&info->georef, info->width);
-    return status;
+    exr_attr_get_double(self->file, PART, "talus:heightUnit", &place.height_unit);
+    return out_place_read(&place, self->path, info, error);
 }
 
 static tl_status read_parameters(exr_source *self, tl_error *error)

@@ -1,5 +1,6 @@
 #include "lib/base/error.h"
 #include "lib/base/parallel.h"
+#include "lib/out/heightmap_read.h"
 #include "lib/out/out.h"
 #include "lib/scene/north_up.h"
 
@@ -193,7 +194,9 @@ static bool is_exr(const char *path)
 
 tl_source *tl_open_with(const char *path, const tl_dem_options *options, tl_error *error)
 {
-    return is_exr(path) ? out_exr_open(path, error) : tl_dem_open(&path, 1, options, error);
+    if (is_exr(path))
+        return out_exr_open(path, error);
+    return out_heightmap_is_name(path) ? out_heightmap_open(path, error) : tl_dem_open(&path, 1, options, error);
 }
 
 tl_source *tl_open(const char *path, tl_error *error)

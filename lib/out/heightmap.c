@@ -211,8 +211,7 @@ static tl_status write_sidecar(const tl_source_info *info, const tl_range *range
     return status;
 }
 
-/* "x.png" to "x.json"; the others keep their ending, "x.r16.json", so that they do not share one. */
-static char *sidecar_path(const char *path, out_heightmap_kind kind)
+char *out_sidecar_path(const char *path, out_heightmap_kind kind)
 {
     const char *dot = strrchr(path, '.');
     size_t stem = kind == OUT_HEIGHTMAP_PNG16 ? (size_t)(dot - path) : strlen(path);
@@ -290,7 +289,7 @@ static tl_status commit_both(tl_output *image, tl_output *json, const char *besi
 static tl_status write_pair(const tl_source *source, out_heightmap_kind kind, const char *path,
                             const tl_write_options *options, tl_error *error)
 {
-    char *beside = sidecar_path(path, kind);
+    char *beside = out_sidecar_path(path, kind);
     tl_output *image = beside ? tl_output_open(path, options->overwrite, error) : NULL;
     tl_output *json = image ? tl_output_open(beside, options->overwrite, error) : NULL;
     tl_status status = json     ? write_both(source, kind, image, json, options->run, error)

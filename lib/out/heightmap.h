@@ -33,6 +33,10 @@ typedef struct out_heightmap {
 tl_status out_heightmap_write(const tl_source *source, const out_heightmap *how, tl_output *output, const tl_run *run,
                               tl_error *error);
 
+/* Name of the JSON file: "x.png" to "x.json"; the others keep their ending, "x.r16.json", so that they do not share
+ * one. To be freed; NULL when out of memory. */
+char *out_sidecar_path(const char *path, out_heightmap_kind kind);
+
 /* Adds where a grid lies and how it was made: geotransform, crs, crs_wkt and parameters. */
 void out_json_add_record(json_t *object, const tl_source_info *info);
 

@@ -1,6 +1,8 @@
 #include "lib/out/mesh_read.h"
 
 #include "lib/base/error.h"
+#include "lib/base/georef.h"
+#include "lib/base/parallel.h"
 #include "lib/base/size.h"
 
 #include <jansson.h>
@@ -10,6 +12,7 @@
 #include <math.h>
 #include <stdio.h>
 #include <string.h>
+#include <sys/stat.h>
 
 enum {
     GLB_MAGIC = 0x46546c67,
@@ -51,6 +54,37 @@ static tl_status read_all(const char *path, bytes *out, tl_error *error)
     out->count = (size_t)size;
     out->all[size] = 0;
     return TL_OK;
+}
+
+/* Anyone may have written the file. */
+static tl_status note(out_mesh_file *out, const char *name, const char *value, tl_error *error)
+{
+    enum { MOST = 64 };
+    char clean[2][480];
+    snprintf(clean[0], sizeof clean[0], "%s", name);
+    snprintf(clean[1], sizeof clean[1], "%s", value);
+    tl_make_printable(clean[0]);
+    tl_make_printable(clean[1]);
+    if (out->record_count == MOST)
+        return TL_OK;
+    return tl_parameters_add(&out->record, &out->record_count, clean[0], clean[1], error);
+}
+
+/* A comment as OBJ and PLY have it: "talus VERSION, frame NAME", "origin ...", "CRS NAME" or "NAME: VALUE". */
+static tl_status note_comment(out_mesh_file *out, char *text, tl_error *error)
+{
+    char frame[16];
+    if (sscanf(text, "talus %*[^,], frame %15[a-z]", frame) == 1)
+        return note(out, "frame", frame, error);
+    if (strncmp(text, "origin ", 7) == 0)
+        return note(out, "origin", text + 7, error);
+    if (strncmp(text, "CRS ", 4) == 0)
+        return note(out, "crs", text + 4, error);
+    char *colon = strstr(text, ": ");
+    if (!colon)
+        return TL_OK;
+    *colon = 0;
+    return note(out, text, colon + 2, error);
 }
 
 static bool make_room(out_mesh_file *out)
@@ -116,10 +150,14 @@ static bool read_ply_header(bytes *in, out_mesh_file *out, bool *wide)
         return false;
     if (!take_line(in, line, sizeof line) || strcmp(line, "format binary_little_endian 1.0") != 0)
         return false;
-    do {
+    for (;;) {
         if (!take_line(in, line, sizeof line))
             return false;
-    } while (strncmp(line, "comment", 7) == 0);
+        if (strncmp(line, "comment ", 8) != 0)
+            break;
+        if (note_comment(out, line + 8, NULL) != TL_OK)
+            return false;
+    }
     if (sscanf(line, "element vertex %zu", &out->vertex_count) != 1)
         return false;
     for (int a = 0; a < 3; a++) {
@@ -173,7 +211,11 @@ static tl_status read_obj(bytes *in, out_mesh_file *out, tl_error *error)
             out->vertex_count += in->all[i] == 'v' && in->all[i + 1] == ' ';
             out->triangle_count += in->all[i] == 'f' && in->all[i + 1] == ' ';
         }
-    if (!make_room(out))
+    char text[512];
+    tl_status status = TL_OK;
+    while (status == TL_OK && in->at < in->count && in->all[in->at] == '#' && take_line(in, text, sizeof text))
+        status = note_comment(out, text + (text[1] == ' ' ? 2 : 1), error);
+    if (status != TL_OK || !make_room(out))
         return tl_fail_memory(error, in->path);
     size_t v = 0, f = 0;
     for (char *line = (char *)in->all; line; line = strchr(line, '\n')) {
@@ -216,6 +258,14 @@ static tl_status read_stl(bytes *in, out_mesh_file *out, tl_error *error)
     from_text = strstr(head, " ecef from ");
     if (from_text && sscanf(from_text, " ecef from %lf %lf %lf", &origin[0], &origin[1], &origin[2]) != 3)
         return malformed(in, "its header", error);
+    char frame[16], place[80];
+    tl_status status = TL_OK;
+    if (sscanf(head, "talus %*s %15[a-z]", frame) == 1)
+        status = note(out, "frame", frame, error);
+    if (status == TL_OK && sscanf(head, "talus %*s enu at %79[-+.0-9 ]", place) == 1)
+        status = note(out, "origin", place, error);
+    if (status != TL_OK)
+        return status;
     for (size_t k = 0; k < out->vertex_count; k++) {
         const unsigned char *from = in->all + HEAD + k / 3 * RECORD + 12 + k % 3 * 12;
         for (int a = 0; a < 3; a++)
@@ -357,6 +407,30 @@ static tl_status take_glb(json_t *root, const bytes *binary, out_mesh_file *out,
     return status;
 }
 
+/* The extras that talus gives an asset. */
+static tl_status note_extras(json_t *root, out_mesh_file *out, tl_error *error)
+{
+    json_t *extras = json_object_get(json_object_get(root, "asset"), "extras"), *value;
+    json_t *origin = json_object_get(extras, "origin");
+    const char *name, *frame = json_string_value(json_object_get(extras, "frame"));
+    tl_status status = frame ? note(out, "frame", frame, error) : TL_OK;
+    if (status == TL_OK && origin) {
+        char text[128];
+        snprintf(text, sizeof text, "longitude %.12g latitude %.12g height %.6f",
+                 json_number_value(json_object_get(origin, "longitude")),
+                 json_number_value(json_object_get(origin, "latitude")),
+                 json_number_value(json_object_get(origin, "height")));
+        status = note(out, "origin", text, error);
+    }
+    const char *crs = json_string_value(json_object_get(extras, "crs"));
+    if (status == TL_OK && crs)
+        status = note(out, "crs", crs, error);
+    json_object_foreach(json_object_get(extras, "parameters"), name,
+                        value) if (status == TL_OK && json_is_string(value)) status =
+        note(out, name, json_string_value(value), error);
+    return status;
+}
+
 static tl_status read_glb(bytes *in, out_mesh_file *out, tl_error *error)
 {
     if (in->count < 20 || word_at(in->all) != GLB_MAGIC || word_at(in->all + 16) != CHUNK_JSON)
@@ -369,6 +443,8 @@ static tl_status read_glb(bytes *in, out_mesh_file *out, tl_error *error)
         return malformed(in, "its length", error);
     json_t *root = json_loadb((const char *)in->all + 20, text, 0, NULL);
     tl_status status = root ? take_glb(root, &binary, out, error) : malformed(in, "its JSON", error);
+    if (status == TL_OK)
+        status = note_extras(root, out, error);
     json_decref(root);
     return status;
 }
@@ -379,6 +455,7 @@ void out_mesh_free(out_mesh_file *file)
 {
     free(file->xyz);
     free(file->indices);
+    free(file->record);
     *file = (out_mesh_file){0};
 }
 
@@ -406,4 +483,37 @@ tl_status out_mesh_read(const char *path, out_mesh_file *out, tl_error *error)
         return status;
     }
     return tl_fail(error, TL_ERROR_ARGUMENT, "%s: only .glb, .obj, .ply and .stl can be read back", path);
+}
+
+/* The bytes, and at most as many again and half for coordinates and corners. */
+static tl_status fits(const char *path, const tl_run *run, tl_error *error)
+{
+    struct stat status;
+    if (stat(path, &status) != 0)
+        return tl_fail_system(error, path, "read", errno);
+    return tl_run_fits(run, 3.5 * (double)status.st_size, path, "reading the mesh", error);
+}
+
+tl_status tl_mesh_read_summary(const char *path, const tl_run *run, tl_mesh_summary *out, tl_error *error)
+{
+    out_mesh_file file;
+    tl_status status = fits(path, run, error);
+    if (status == TL_OK)
+        status = out_mesh_read(path, &file, error);
+    if (status != TL_OK)
+        return status;
+    *out = (tl_mesh_summary){.vertex_count = file.vertex_count,
+                             .triangle_count = file.triangle_count,
+                             .record = file.record,
+                             .record_count = file.record_count};
+    for (int a = 0; a < 3; a++) {
+        out->low[a] = out->high[a] = file.vertex_count ? file.xyz[0][a] : 0;
+        for (size_t k = 1; k < file.vertex_count; k++) {
+            out->low[a] = fmin(out->low[a], file.xyz[k][a]);
+            out->high[a] = fmax(out->high[a], file.xyz[k][a]);
+        }
+    }
+    file.record = NULL;
+    out_mesh_free(&file);
+    return TL_OK;
 }

@@ -10,6 +10,9 @@ typedef struct out_mesh_file {
     size_t vertex_count, triangle_count;
     double (*xyz)[3];
     uint32_t *indices; /* 3 * triangle_count, below vertex_count */
+    /* What the file tells of itself, cut to lines: "frame", "origin" and the mesh's own record. */
+    tl_parameter *record;
+    size_t record_count;
 } out_mesh_file;
 
 /* Reads a .ply, .obj, .glb or .stl. Files that talus would not write are refused; whatever the bytes, nothing worse

@@ -591,6 +591,81 @@ def formats_hold_the_same_heights(case):
                        truth.values[row * truth.width:(row + 1) * truth.width].tobytes(), f"{kind}: row {row}")
 
 
+def outputs_are_read_back(case):
+    """info tells of every format what made it; heights that were read back are those that were written."""
+    write_dem(case, holes=True)
+    for ending in ("exr", "tif", "raw", "r16", "png"):
+        case.run("synth", "dem.tif", "-l", 1, "--seed", 5, "-q", "-o", f"a.{ending}")
+        told = json.loads(case.run("info", "--json", f"a.{ending}").out)
+        expect(told["parameters"]["seed"] == "5" and told["parameters"]["input"] == "dem.tif", f"{ending}: {told['parameters']}")
+        expect(told["georeference"]["crs"]["epsg"] == 32611, f"{ending}: {told['georeference']}")
+        case.run("synth", f"a.{ending}", "-l", 0, "--support", "point", "--compression", "none", "-q", "-o", f"{ending}-again.exr")
+    truth = read_exr(case.path("exr-again.exr")).values
+    for ending in ("tif", "raw"):
+        expect(read_exr(case.path(f"{ending}-again.exr")).values.tobytes() == truth.tobytes(), ending)
+    with open(case.path("a.json"), encoding="utf-8") as file:
+        step = json.load(file)["scale"]
+    for ending in ("r16", "png"):
+        for found, height in zip(read_exr(case.path(f"{ending}-again.exr")).values, truth):
+            expect(same(found, height) or abs(found - height) <= 0.5 * step + 2e-5, f"{ending}: {found} for {height}")
+    for ending in ("glb", "obj", "ply"):
+        case.run("simplify", "dem.tif", "-e", 3, "-q", "-o", f"m.{ending}")
+        told = json.loads(case.run("info", "--json", f"m.{ending}").out)
+        with open(os.path.join(ROOT, "doc", "mesh_info.schema.json"), encoding="utf-8") as file:
+            check_schema(told, json.load(file))
+        expect(told["record"]["max_error"] == "3" and told["record"]["frame"] == "enu" and told["triangles"] > 0, f"{told}")
+    case.run("simplify", "dem.tif", "-e", 3, "-q", "-o", "m.stl")
+    expect("frame: enu" in case.run("info", "m.stl").out, "frame of the STL")
+
+
+def sidecars_are_checked(case):
+    """Heights without their JSON file, or with one that does not fit, are refused in one line."""
+    write_dem(case)
+    for ending, beside in (("raw", "a.raw.json"), ("r16", "a.r16.json"), ("png", "a.json")):
+        case.run("synth", "dem.tif", "-l", 0, "-q", "-o", f"a.{ending}")
+        with open(case.path(beside), encoding="utf-8") as file:
+            good = file.read()
+        about = json.loads(good)
+        for text in (None, "", "[]", "{}", "{", good.replace(f'"width": {about["width"]}', '"width": -3'),
+                     good.replace(f'"width": {about["width"]}', '"width": 2147483647'),
+                     good.replace(f'"height": {about["height"]}', '"height": 3'),
+                     re.sub(r'"(width|height|scale|offset)": [^,]*', r'"\1": 1e308', good)):
+            os.unlink(case.path(beside))
+            if text is not None:
+                with open(case.path(beside), "w", encoding="utf-8") as file:
+                    file.write(text)
+            said = case.run("info", f"a.{ending}", status=1).err
+            expect(said.count("\n") == 1 and f"a.{ending}" in said, f"{text}: {said}")
+            with open(case.path(beside), "w", encoding="utf-8") as file:
+                file.write(good)
+
+
+def outputs_are_made_again(case):
+    """--same-as gives the same bytes in every format, with files of its options and names with spaces; other options go over it."""
+    write_dem(case, "a dem.tif", width=100, height=90)
+    case.run("stats", "a dem.tif", "--maps", "maps.tif", "-q")
+    options = ("-l", 1, "--hurst-map", "maps.tif:1", "--window", "3,4,50,40", "--height-quantum", 0.25)
+    os.mkdir(case.path("elsewhere"))
+    for ending in ("exr", "tif", "raw", "r16", "png"):
+        case.run("synth", "a dem.tif", *options, "-q", "-o", f"a.{ending}")
+        said = case.run("synth", "--same-as", f"a.{ending}", "-t", 1, "-o", f"elsewhere/b.{ending}").err
+        expect("byte for byte" in said, said)
+        with open(case.path(f"a.{ending}"), "rb") as one, open(case.path(f"elsewhere/b.{ending}"), "rb") as other:
+            expect(one.read() == other.read(), ending)
+    case.run("synth", "--same-as", "a.exr", "--seed", 9, "-q", "-o", "c.exr")
+    command = json.loads(case.run("info", "--json", "c.exr").out)["parameters"]["command"]
+    expect(command == 'synth --levels 1 --seed 9 --hurst-map maps.tif:1 --window 3,4,50,40 --height-quantum 0.25 "a dem.tif"', command)
+    case.run("synth", "--same-as", "c.exr", "--seed", 0, "-q", "-o", "d.exr")
+    with open(case.path("a.exr"), "rb") as one, open(case.path("d.exr"), "rb") as other:
+        expect(one.read() == other.read(), "the default over the record")
+    write_dem(case, "a dem.tif", width=101, height=90)
+    refused = case.run("synth", "--same-as", "a.exr", "-q", "-o", "e.exr", status=1).err
+    expect("not kept" in refused, refused)
+    expect("was made by talus synth" in case.run("noise", "--same-as", "a.exr", "-o", "f.exr", status=2).err, "the command")
+    os.unlink(case.path("a dem.tif"))
+    expect("name the input too" in case.run("synth", "--same-as", "a.exr", "-o", "f.exr", status=2).err, "a lost input")
+
+
 def png_within_half_a_step(case):
     write_dem(case, holes=True)
     for dem in (EXAMPLE, "dem.tif"):
@@ -1027,7 +1102,7 @@ TESTS = [
     bar_only_on_a_terminal, progress_lines_are_json, quiet_is_silent,
     json_keeps_its_schema, statistics_keep_their_schema, real_files_keep_the_schema, window_costs_its_blocks, a_part_is_that_part, corners_agree_with_gdal,
     names_of_any_bytes,
-    formats_hold_the_same_heights, png_within_half_a_step, point_samples_are_kept, point_samples_of_the_andes_are_kept,
+    formats_hold_the_same_heights, outputs_are_read_back, sidecars_are_checked, outputs_are_made_again, png_within_half_a_step, point_samples_are_kept, point_samples_of_the_andes_are_kept,
     area_means_stay_on_their_footprint,
     glb_is_in_metres, frames_agree, simplify_keeps_its_word, diagonals_are_turned, codings_keep_the_bound, layers_are_written_beside, inputs_are_not_overwritten, layers_are_refused_before_the_work, vertices_tell_where_they_came_from,
     manuals_show_what_works, man_page_knows_every_option,

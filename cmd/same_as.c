@@ -1,0 +1,211 @@
+#include "cmd/same_as.h"
+
+#include <popt.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <unistd.h>
+
+/* The parameter `name` of a file that talus wrote, to be freed; NULL, told, where there is none. */
+static char *read_parameter(const char *path, const char *name)
+{
+    tl_error error;
+    char *value = NULL;
+    tl_source *source = tl_open(path, &error);
+    if (!source) {
+        complain("%s", error.text);
+        return NULL;
+    }
+    for (size_t k = 0; k < source->info.parameter_count && !value; k++)
+        if (strcmp(source->info.parameters[k].name, name) == 0)
+            value = strdup(source->info.parameters[k].value);
+    tl_source_destroy(source);
+    if (!value)
+        complain("%s: does not tell the command that made it; --same-as takes what synth and noise of this version "
+                 "write",
+                 path);
+    return value;
+}
+
+static bool is_there(const char *path)
+{
+    return access(path, F_OK) == 0;
+}
+
+/* A file of the record: as named, or beside `same_as`; to be freed. NULL: nowhere. "RASTER:BAND" is looked for as it
+ * is and without the band. */
+static char *find_file(const char *name, const char *same_as)
+{
+    const char *slash = strrchr(same_as, '/'), *colon = strrchr(name, ':');
+    size_t folder = slash ? (size_t)(slash - same_as) + 1 : 0, length = colon ? (size_t)(colon - name) : strlen(name);
+    size_t room = folder + strlen(name) + 1;
+    char *path = malloc(room), *bare = malloc(room);
+    bool found = false;
+    for (int k = 0; path && bare && k < 2 && !found; k++) {
+        snprintf(path, room, "%.*s%s", k ? (int)folder : 0, same_as, name);
+        snprintf(bare, room, "%.*s%.*s", k ? (int)folder : 0, same_as, (int)length, name);
+        found = is_there(path) || is_there(bare);
+    }
+    free(bare);
+    if (found)
+        return path;
+    free(path);
+    return NULL;
+}
+
+static bool takes_a_file(const char *word)
+{
+    return strcmp(word, "--hurst-map") == 0 || strcmp(word, "--delta-map") == 0 || strcmp(word, "--sigma-map") == 0 ||
+           strcmp(word, "--layer-rules") == 0 || strcmp(word, "--geoid") == 0;
+}
+
+/* The words of the record with their files found, one block that free() frees; those that are not found stay as they
+ * are, and what opens them tells. "egm96" and "none" are no files. */
+typedef struct words {
+    const char **list;
+    char **owned;
+    int count;
+} words;
+
+static void free_words(words *w)
+{
+    for (int k = 0; k < w->count; k++)
+        free(w->owned[k]);
+    free(w->owned);
+    free(w->list);
+}
+
+static bool split(const char *record, const char *same_as, words *out)
+{
+    int count;
+    const char **parsed;
+    if (poptParseArgvString(record, &count, &parsed) != 0)
+        return false;
+    *out = (words){calloc((size_t)count, sizeof *out->list), calloc((size_t)count, sizeof *out->owned), count};
+    bool good = out->list && out->owned;
+    for (int k = 0; k < count && good; k++) {
+        char *found = k && takes_a_file(parsed[k - 1]) ? find_file(parsed[k], same_as) : NULL;
+        out->list[k] = out->owned[k] = found ? found : strdup(parsed[k]);
+        good = out->owned[k];
+    }
+    if (!good)
+        out->count = 0;
+    free(parsed);
+    return good;
+}
+
+/* The recorded inputs, the last `inputs` words, where they lie now. */
+static bool find_inputs(const char *same_as, size_t inputs, words *recorded)
+{
+    for (size_t k = (size_t)recorded->count - inputs; k < (size_t)recorded->count; k++) {
+        char *found = find_file(recorded->list[k], same_as);
+        if (!found && !strpbrk(recorded->list[k], "*?[@")) {
+            complain("%s: was made of %s, which is not here and not beside it; name the input too", same_as,
+                     recorded->list[k]);
+            return false;
+        }
+        if (!found)
+            continue;
+        free(recorded->owned[k]);
+        recorded->list[k] = recorded->owned[k] = found;
+    }
+    return true;
+}
+
+/* Parses the record's options and the command line's own behind them, with the record's inputs if it has none. */
+static bool parse_all(const command *self, const char *same_as, words *recorded, int argc, const char **argv,
+                      const option_group *groups, arguments *rest)
+{
+    const char **all = calloc((size_t)recorded->count + (size_t)argc + 1, sizeof *all);
+    size_t own = rest->count;
+    int count = 0;
+    options_undo(groups, rest);
+    arguments_free(rest);
+    bool good = all && options_parse(self->name, recorded->count, recorded->list, groups, rest) == PARSE_OK &&
+                (own || find_inputs(same_as, rest->count, recorded));
+    int taken = recorded->count - (good && own ? (int)rest->count : 0);
+    options_undo(groups, rest);
+    arguments_free(rest);
+    for (int k = 0; k < taken && good; k++)
+        all[count++] = recorded->list[k];
+    for (int k = 1; k < argc && good; k++)
+        all[count++] = argv[k];
+    good = good && options_parse(self->name, count, all, groups, rest) == PARSE_OK;
+    free(all);
+    return good;
+}
+
+bool same_as_parse(const command *self, const char *same_as, int argc, const char **argv, const option_group *groups,
+                   arguments *rest)
+{
+    words recorded = {0};
+    char *path = strdup(same_as); /* parsing again frees the text */
+    char *record = path ? read_parameter(path, "command") : NULL;
+    bool good = record && split(record, path, &recorded);
+    if (good && strcmp(recorded.list[0], self->name) != 0) {
+        complain("%s: was made by talus %s, not by talus %s", path, recorded.list[0], self->name);
+        good = false;
+    }
+    good = good && parse_all(self, path, &recorded, argc, argv, groups, rest);
+    free_words(&recorded);
+    free(record);
+    free(path);
+    return good;
+}
+
+/* ---- Comparing ---- */
+
+/* Whether two files have the same bytes; false too where one cannot be read. */
+static bool equal_files(const char *a, const char *b)
+{
+    enum { CHUNK = 65536 };
+    FILE *files[2] = {fopen(a, "rb"), fopen(b, "rb")};
+    char *bytes[2] = {malloc(CHUNK), malloc(CHUNK)};
+    bool equal = files[0] && files[1] && bytes[0] && bytes[1];
+    for (size_t got = CHUNK; equal && got == CHUNK;) {
+        got = fread(bytes[0], 1, CHUNK, files[0]);
+        equal = fread(bytes[1], 1, CHUNK, files[1]) == got && memcmp(bytes[0], bytes[1], got) == 0 &&
+                !ferror(files[0]) && !ferror(files[1]);
+    }
+    for (int k = 0; k < 2; k++) {
+        free(bytes[k]);
+        if (files[k])
+            fclose(files[k]);
+    }
+    return equal;
+}
+
+/* A failed run leaves nothing: neither the file nor the JSON file beside it. */
+static void remove_output(const char *path)
+{
+    size_t room = strlen(path) + sizeof ".json";
+    char *beside = malloc(room);
+    unlink(path);
+    if (!beside)
+        return;
+    bool png = command_ends_with(path, ".png");
+    snprintf(beside, room, "%.*s.json", (int)(strlen(path) - (png ? 4 : 0)), path);
+    if (png || command_ends_with(path, ".r16") || command_ends_with(path, ".raw"))
+        unlink(beside);
+    free(beside);
+}
+
+int same_as_compare(const char *same_as, const common *shared, const arguments *rest)
+{
+    const tl_format *then = tl_format_of(same_as), *now = tl_format_of(shared->output);
+    char *record = then && then == now && rest->record ? read_parameter(same_as, "command") : NULL;
+    int status = EXIT_DONE;
+    if (record && strcmp(record, rest->record) == 0 && is_there(shared->output)) {
+        if (equal_files(same_as, shared->output))
+            command_say(shared, "%s: equal to %s, byte for byte", shared->output, same_as);
+        else {
+            complain("%s: made by the same command as %s, but not equal to it, so not kept: an input or the version of "
+                     "talus is another",
+                     shared->output, same_as);
+            remove_output(shared->output);
+            status = EXIT_FAILED;
+        }
+    }
+    free(record);
+    return status;
+}
