@@ -1,0 +1,32 @@
+#!/bin/sh
+# Has every output format read by programs that are not ours, and compares what they find with what was written: GDAL and
+# its validator of cloud-optimised files, OpenEXR's own tools, OpenImageIO, Blender, assimp, the glTF validator, gltfpack.
+# Installs them where it may (Debian's packages as root, npm's in a folder of its own), and says which it did without.
+#   tests/judges/run.sh [PROGRAM]    (default: built from these sources)
+set -eu
+here=$(cd "$(dirname "$0")/../.." && pwd)
+. "$here/examples/packages.sh"
+work=$(mktemp -d "${TMPDIR:-/tmp}/talus-judges-XXXXXX")
+trap 'rm -rf "$work"' EXIT
+
+if [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null; then
+    packages="gdal-bin python3-gdal python3-numpy openexr openimageio-tools blender assimp-utils"
+    command -v npm >/dev/null || packages="$packages nodejs npm"
+    for package in $packages; do
+        dpkg-query -W -f '${Status}' "$package" 2>/dev/null | grep -q '^install ok' ||
+            apt-get install -y --no-install-recommends "$package" >"$work/apt.log" 2>&1 || echo "not installed: $package"
+    done
+fi
+if command -v npm >/dev/null; then
+    npm install --silent --no-fund --no-audit --prefix "$work/npm" gltf-validator gltfpack >"$work/npm.log" 2>&1 ||
+        echo "not installed: gltf-validator, gltfpack"
+fi
+
+if [ $# -gt 0 ]; then
+    program=$1
+else
+    need_packages $build_packages
+    meson setup "$work/build" "$here" -Dtests=false >"$work/build.log" && ninja -C "$work/build" --quiet
+    program=$work/build/cmd/talus
+fi
+TALUS_NPM=$work/npm/node_modules python3 "$here/tests/judges/formats.py" "$program" "$work"
