@@ -232,6 +232,8 @@ static void print_json(const facts *f)
                                (json_int_t)info->width, "height", (json_int_t)info->height, "level", info->level,
                                "raster_type", info->type == TL_RASTER_AREA ? "area" : "point", "quantum", info->quantum,
                                "georeference", georef_json(f));
+    if (info->contents)
+        json_object_set_new(object, "contents", string(info->contents));
     json_object_set_new(object, "file", f->has_details ? file_json(f) : json_null());
     if (file_count(f))
         json_object_set_new(object, "files", files_json(f));
@@ -327,6 +329,8 @@ static void print_text(const facts *f)
     print_plain(info->name);
     printf("\nsize         %lld x %lld samples, %s\n", (long long)info->width, (long long)info->height,
            info->type == TL_RASTER_AREA ? "each the mean of its cell (area)" : "each a point");
+    if (info->contents)
+        printf("contents     %s, no heights\n", info->contents);
     if (f->has_details)
         print_file(f);
     print_files(f);
@@ -395,7 +399,7 @@ static int inform(const settings *set, const arguments *inputs)
 
 static int run(const command *self, int argc, const char **argv, bool help)
 {
-    settings set = {0};
+    settings set = {.common = {.any_contents = true}};
     const option output[] = {
         {"json", 'j', OPTION_FLAG, &set.json, NULL, NULL, "for machines: one JSON object", 0, 0, NULL}, {0}};
     const option input[] = {COMMON_INPUT(set.common), {0}};

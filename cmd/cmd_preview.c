@@ -68,7 +68,7 @@ static int draw(settings *set, const arguments *inputs)
 
 static int run(const command *self, int argc, const char **argv, bool help)
 {
-    settings set = {.preview = {.exaggeration = 1, .fov = 50}};
+    settings set = {.common = {.any_contents = true}, .preview = {.exaggeration = 1, .fov = 50}};
     const option picture[] = {
         {"width", 0, OPTION_INTEGER, &set.width, NULL, "N",
          "pixels, 1...32768 (default: the raster's own, at most 2048; 1920 in perspective)", 1, 32768, NULL},

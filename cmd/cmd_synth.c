@@ -33,7 +33,7 @@ typedef struct settings {
     double quantum; /* step of the heights */
     bool quantum_given;
     double lerc_error;
-    bool lerc_error_given, mip_given, cog;
+    bool lerc_error_given, mip_given, cog, half, one_file;
     bool size_given, hurst_given, delta_given;
     double max_error; /* of the framework that the DEM is reduced to first */
     bool max_error_given, verify;
@@ -81,6 +81,7 @@ static tl_status write_samples(const settings *set, const tl_source *made, const
     const tl_write_options options = {.overwrite = set->common.overwrite,
                                       .cog = set->cog,
                                       .lerc_error = set->lerc_error,
+                                      .half_error = set->half ? set->quantum / 2 : 0,
                                       .validity = set->common.voids && strcmp(set->common.voids, "keep") != 0,
                                       .compression = (tl_compression)set->compression,
                                       .mip = set->cog && !set->mip_given ? usual : (tl_mip)set->mip,
@@ -89,22 +90,48 @@ static tl_status write_samples(const settings *set, const tl_source *made, const
     return tl_write_grid(made, set->common.output, &options, error);
 }
 
+/* Heights and layers into one file. */
+static tl_status write_together(const settings *set, const tl_source *heights, const tl_source *surface,
+                                const tl_run *run, tl_error *error)
+{
+    enum { MOST = 64 };
+    const tl_layer_options options = {.rules = set->layer_rules,
+                                      .overwrite = set->common.overwrite,
+                                      .compression = (tl_compression)set->compression,
+                                      .run = run};
+    const char *kinds[MOST];
+    char *list = strdup(set->layers), *rest;
+    size_t count = 0;
+    for (char *kind = list ? strtok_r(list, ",", &rest) : NULL; kind && count < MOST; kind = strtok_r(NULL, ",", &rest))
+        kinds[count++] = kind;
+    tl_status status = TL_ERROR_MEMORY;
+    if (list)
+        status = tl_write_layers(heights, surface, kinds, count, set->common.output, &options, error);
+    else
+        *error = (tl_error){TL_ERROR_MEMORY, "not enough memory for a name"};
+    free(list);
+    return status;
+}
+
 /* With the command line in the record, from which --same-as makes it again. */
-static tl_status write_recorded(const settings *set, const tl_source *heights, const tl_run *run, tl_error *error)
+static tl_status write_recorded(const settings *set, const tl_source *heights, const tl_source *surface,
+                                const tl_run *run, tl_error *error)
 {
     const tl_parameter line = {"command", set->record};
     tl_source *made = tl_recorded_create(heights, &line, set->record ? 1 : 0, error);
-    tl_status status = made ? write_samples(set, made, run, error) : TL_ERROR_MEMORY;
+    tl_status status = !made           ? TL_ERROR_MEMORY
+                       : set->one_file ? write_together(set, made, surface, run, error)
+                                       : write_samples(set, made, run, error);
     tl_source_destroy(made);
     return status;
 }
 
 static tl_status write_grid(const settings *set, const tl_source *made, const tl_run *run, tl_error *error)
 {
-    if (!set->quantum_given)
-        return write_recorded(set, made, run, error);
-    tl_source *steps = tl_quantized_create(made, set->quantum, error);
-    tl_status status = steps ? write_recorded(set, steps, run, error) : TL_ERROR_MEMORY;
+    tl_source *steps = set->quantum_given ? tl_quantized_create(made, set->quantum, error) : NULL;
+    if (set->quantum_given && !steps)
+        return TL_ERROR_MEMORY;
+    tl_status status = write_recorded(set, steps ? steps : made, made, run, error);
     tl_source_destroy(steps);
     return status;
 }
@@ -162,7 +189,7 @@ static tl_status check_layers(const settings *set, const tl_source *made, tl_err
         char *path = layer_path(set, kind);
         tl_source *layer = tl_layer_create(made, kind, 0, &options, error);
         status = layer ? TL_OK : error->status;
-        if (layer && path && !set->common.overwrite && access(path, F_OK) == 0) {
+        if (layer && path && !set->one_file && !set->common.overwrite && access(path, F_OK) == 0) {
             *error = (tl_error){.status = TL_ERROR_IO};
             snprintf(error->text, sizeof error->text, "%.300s: exists already; name another file or give --overwrite",
                      path);
@@ -178,7 +205,7 @@ static tl_status check_layers(const settings *set, const tl_source *made, tl_err
 static tl_status write_layers(const settings *set, const tl_source *made, const tl_run *run, progress *bar,
                               tl_error *error)
 {
-    char *list = set->layers ? strdup(set->layers) : NULL, *rest;
+    char *list = set->layers && !set->one_file ? strdup(set->layers) : NULL, *rest;
     tl_status status = TL_OK;
     for (char *kind = list ? strtok_r(list, ",", &rest) : NULL; kind && status == TL_OK;
          kind = strtok_r(NULL, ",", &rest)) {
@@ -244,6 +271,13 @@ static bool grid_output_ok(const settings *set)
         complain("--mip: only .exr and .tif hold coarser levels, not %s; leave it out", set->common.output);
     else if (set->cog && !tif)
         complain("--cog: is an order of .tif, not of %s; leave it out", set->common.output);
+    else if (set->half && (!exr || !set->quantum_given || set->preset))
+        complain("--half is for .exr, with --height-quantum Q: heights move by less than that");
+    else if (set->one_file && (!exr || !set->layers || set->layer_format != LAYERS_AS_EXR || set->mip || set->half))
+        complain("--one-file puts --layers into the .exr of the heights; without --layer-format png, --mip and --half");
+    else if (set->one_file && set->common.voids && strcmp(set->common.voids, "keep") != 0)
+        complain("--one-file holds no validity, which --voids %s writes beside the heights; leave one of them away",
+                 set->common.voids);
     else if (set->lerc_error_given && set->compression != TL_COMPRESSION_LERC)
         complain("--lerc-error is for --compression lerc; give that too, or leave it away");
     else
@@ -293,7 +327,7 @@ static const tl_source *open_ground(const settings *set, const arguments *inputs
         of->dem = of->opened.source;
         if (!of->dem || !set->max_error_given)
             return of->dem;
-        double moved = (set->quantum_given ? set->quantum / 2 : 0) + set->lerc_error;
+        double moved = (set->quantum_given ? set->quantum / (set->half ? 1 : 2) : 0) + set->lerc_error;
         double bound = set->max_error - moved;
         if (bound < 0) {
             *error = (tl_error){.status = TL_ERROR_ARGUMENT};
@@ -497,6 +531,16 @@ static void list_schemes(bool noise)
          0,                                                                                                           \
          0,                                                                                                           \
          compressions},                                                                                               \
+        {"half",                                                                                                      \
+         0,                                                                                                           \
+         OPTION_FLAG,                                                                                                 \
+         &(s).half,                                                                                                   \
+         NULL,                                                                                                        \
+         NULL,                                                                                                        \
+         "an .exr of half floats, refused where a height would move by more than --height-quantum",                   \
+         0,                                                                                                           \
+         0,                                                                                                           \
+         NULL},                                                                                                       \
         {"lerc-error",                                                                                                \
          0,                                                                                                           \
          OPTION_NUMBER,                                                                                               \
@@ -620,6 +664,8 @@ static int run_synth(const command *self, int argc, const char **argv, bool help
                               0, 0, NULL},
                              {"layer-format", 0, OPTION_CHOICE, &set.layer_format, NULL, "FORMAT",
                               "of the layers (default: exr)", 0, 0, layer_formats},
+                             {"one-file", 0, OPTION_FLAG, &set.one_file, NULL, NULL,
+                              "put the layers into the .exr of the heights, as channels KIND.R ...", 0, 0, NULL},
                              {"layer-rules", 0, OPTION_TEXT, &set.layer_rules, NULL, "FILE",
                               "a JSON file that says where splat has rock, scree, soil and snow", 0, 0, NULL},
                              {"frame", 0, OPTION_CHOICE, &set.frame, NULL, "FRAME",

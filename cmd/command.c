@@ -180,6 +180,14 @@ opened_input command_open(const common *options, const arguments *inputs, const 
     if (void_options(options, run, &voids, error))
         put_over(&opened, open_files(options, inputs, &quietly, error));
     opened.file = opened.source;
+    if (opened.source && opened.source->info.contents && !options->any_contents) {
+        *error = (tl_error){.status = TL_ERROR_DATA};
+        snprintf(error->text, sizeof error->text,
+                 "%.300s: holds %.60s, no heights; name the heightfield that it was made of", opened.source->info.name,
+                 opened.source->info.contents);
+        command_close(&opened);
+        return opened;
+    }
     cut(options, &opened, error);
     /* a height that is given to voids counts from where the file's heights do */
     if (opened.source && (voids.rule != TL_VOIDS_KEEP || voids.nodata_given))

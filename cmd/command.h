@@ -24,6 +24,7 @@ enum { DEFAULT_MEMORY = 512, OPENED_STEPS = 4 };
 typedef struct common {
     const char *output;
     bool overwrite, quiet, feather;
+    bool any_contents; /* the input need not be heights */
     const char *voids; /* keep, fill or a number */
     const char *geoid; /* none, egm96 or a file */
     int64_t window[4]; /* first column and row, columns, rows */

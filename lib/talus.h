@@ -135,7 +135,8 @@ typedef struct tl_source_info {
     double quantum; /* step between representable heights (1 for an integer DEM without scale), 0 for continuous ones */
     /* What is decoded at once, from the grid's corner on: whole blocks are read with least work. 0: no matter. */
     int64_t block_width, block_height;
-    const char *name;               /* what to call it in messages: the file, mostly; never NULL */
+    const char *name;     /* what to call it in messages: the file, mostly; never NULL */
+    const char *contents; /* what the numbers are where they are no heights: "slope", "depth"; NULL: heights */
     const tl_parameter *parameters; /* how it was made; NULL when parameter_count is 0 */
     size_t parameter_count;
 } tl_source_info;
@@ -1009,6 +1010,8 @@ typedef struct tl_write_options {
     bool cog; /* GeoTIFF: in the order of cloud-optimised ones, by a second file without a name beside the first */
     /* TL_COMPRESSION_LERC: by how much a height may move, in the source's unit; 0: not at all. */
     double lerc_error;
+    /* EXR, above 0: as half floats, where this moves no height by more than that; else TL_ERROR_ARGUMENT. 0: floats. */
+    double half_error;
     tl_frame frame;
     tl_mesh_coding coding; /* of meshes in GLB; others keep theirs */
     /* GLB, of meshes that tl_mesh_parent_heights knows: also write these, as the attribute _PARENT_HEIGHT, and the ways
@@ -1113,6 +1116,12 @@ TL_API tl_source *tl_layer_create(const tl_source *heights, const char *kind, si
  * shares, sRGB; not curvature and sigma); .tif where it has one channel. Pictures have the north in their first row. */
 TL_API tl_status tl_write_layer(const tl_source *heights, const char *kind, const char *path,
                                 const tl_layer_options *options, tl_error *error);
+
+/* Writes heights, as channel Y, and layers of them into one EXR: channels KIND.CHANNEL, as normal.R; those of one value
+ * KIND.Y. `surface` is what the layers are made of, over the same lattice; NULL: `heights`. No mipmaps, no half floats.
+ * tl_open reads the heights. */
+TL_API tl_status tl_write_layers(const tl_source *heights, const tl_source *surface, const char *const *kinds,
+                                 size_t count, const char *path, const tl_layer_options *options, tl_error *error);
 
 /* ---- Game engines and modellers ------------------------------------------------------------------- */
 

@@ -8,6 +8,7 @@
 #include "lib/out/mip.h"
 #include "lib/out/out.h"
 
+#include <half.h>
 #include <openexr.h>
 
 #include <math.h>
@@ -90,6 +91,8 @@ static exr_result_t set_georeference(exr_context_t file, const tl_source_info *i
     if (code == EXR_ERR_SUCCESS)
         code = exr_attr_set_string(file, PART, "gdal:AREA_OR_POINT", info->type == TL_RASTER_AREA ? "Area" : "Point");
     if (code == EXR_ERR_SUCCESS)
+        code = exr_attr_set_string(file, PART, "talus:contents", info->contents ? info->contents : "heights");
+    if (code == EXR_ERR_SUCCESS)
         code = exr_attr_set_double(file, PART, "talus:heightUnit", info->georef.height_unit);
     return code;
 }
@@ -122,7 +125,7 @@ static exr_result_t set_header(exr_context_t file, const tl_source_info *info, c
     window.max.y = (int32_t)info->height - 1;
     centre.x = centre.y = 0;
     int part;
-    exr_result_t code = exr_add_part(file, planes->read ? "layer" : "heights", EXR_STORAGE_TILED, &part);
+    exr_result_t code = exr_add_part(file, info->contents ? "layer" : "heights", EXR_STORAGE_TILED, &part);
     if (code ==
         EXR_ERR_SUCCESS) /* random order, for the file is complete when it gets its name; ours is always the same */
         code = exr_initialize_required_attr(file, PART, &window, &window, 1.0f, &centre, 1.0f, EXR_LINEORDER_RANDOM_Y,
@@ -132,7 +135,8 @@ static exr_result_t set_header(exr_context_t file, const tl_source_info *info, c
                                        options->mip ? EXR_TILE_MIPMAP_LEVELS : EXR_TILE_ONE_LEVEL,
                                        options->mip ? EXR_TILE_ROUND_UP : EXR_TILE_ROUND_DOWN);
     for (size_t k = 0; code == EXR_ERR_SUCCESS && k < planes->count; k++)
-        code = exr_add_channel(file, PART, planes->names[k], EXR_PIXEL_FLOAT, EXR_PERCEPTUALLY_LINEAR, 1, 1);
+        code = exr_add_channel(file, PART, planes->names[k], options->half_error > 0 ? EXR_PIXEL_HALF : EXR_PIXEL_FLOAT,
+                               EXR_PERCEPTUALLY_LINEAR, 1, 1);
     if (code == EXR_ERR_SUCCESS)
         code = set_georeference(file, info);
     if (code == EXR_ERR_SUCCESS)
@@ -144,6 +148,7 @@ static exr_result_t set_header(exr_context_t file, const tl_source_info *info, c
 
 typedef struct worker {
     float *heights;
+    uint16_t *halves; /* the same, where they are stored so */
     exr_encode_pipeline_t pipeline;
     bool begun;
     out_extent extent;
@@ -158,6 +163,7 @@ typedef struct writing {
     exr_context_t file;
     out_tiling tiling; /* of the level in hand */
     int level;         /* halvings of the source's finest */
+    double half_error; /* see tl_write_options */
     out_mip mip;
     worker *workers;
     stream *to;
@@ -180,11 +186,13 @@ static void set_channels(const writing *w, worker *self, tl_window window)
         size_t k = 0;
         while (k + 1 < w->planes->count && strcmp(w->planes->names[k], channel->channel_name) != 0)
             k++;
-        channel->encode_from_ptr = (const uint8_t *)(self->heights + k * samples);
-        channel->user_pixel_stride = sizeof(float);
-        channel->user_line_stride = (int32_t)((size_t)window.width * sizeof(float));
-        channel->user_bytes_per_element = sizeof(float);
-        channel->user_data_type = EXR_PIXEL_FLOAT;
+        int size = self->halves ? sizeof *self->halves : sizeof *self->heights;
+        channel->encode_from_ptr = self->halves ? (const uint8_t *)(self->halves + k * samples)
+                                                : (const uint8_t *)(self->heights + k * samples);
+        channel->user_pixel_stride = size;
+        channel->user_line_stride = (int32_t)window.width * size;
+        channel->user_bytes_per_element = (int16_t)size;
+        channel->user_data_type = self->halves ? EXR_PIXEL_HALF : EXR_PIXEL_FLOAT;
     }
 }
 
@@ -216,6 +224,22 @@ static tl_status read_tile(const writing *w, tl_window window, float *out, tl_er
     return out_mip_read(&w->mip, w->level, window, out, error);
 }
 
+/* The nearest halves, where they are near enough. */
+static tl_status halve_heights(const writing *w, worker *self, size_t count, tl_error *error)
+{
+    for (size_t k = 0; self->halves && k < count; k++) {
+        float z = self->heights[k];
+        self->halves[k] = imath_float_to_half(z);
+        double moved = fabs((double)imath_half_to_float(self->halves[k]) - (double)z);
+        if (moved > w->half_error)
+            return tl_fail(error, TL_ERROR_ARGUMENT,
+                           "%s: a half float would move a height of %.9g by %.3g, more than %.3g; take floats, or a "
+                           "larger height quantum",
+                           tl_output_path(w->to->output), (double)z, moved, w->half_error);
+    }
+    return TL_OK;
+}
+
 static tl_status write_tile(void *context, tl_parallel *loop, uint64_t tile, unsigned index, tl_error *error)
 {
     writing *w = context;
@@ -229,6 +253,9 @@ static tl_status write_tile(void *context, tl_parallel *loop, uint64_t tile, uns
     if (status != TL_OK)
         return status;
     out_extent_add(&self->extent, self->heights, (size_t)(window.width * window.height));
+    status = halve_heights(w, self, (size_t)(window.width * window.height), error);
+    if (status != TL_OK)
+        return status;
     self->loop = loop;
     self->tile = tile;
     exr_result_t code = encode(w, self, window);
@@ -265,7 +292,9 @@ static tl_status write_tiles(writing *w, const tl_run *run, out_extent *extent, 
     for (unsigned i = 0; i < count; i++) {
         w->workers[i].extent = out_extent_empty();
         w->workers[i].heights = tl_alloc_grid(OUT_TILE, OUT_TILE, w->planes->count * sizeof(float));
-        if (!w->workers[i].heights)
+        if (w->half_error > 0)
+            w->workers[i].halves = tl_alloc_grid(OUT_TILE, OUT_TILE, sizeof(uint16_t));
+        if (!w->workers[i].heights || (w->half_error > 0 && !w->workers[i].halves))
             status = tl_fail_memory(error, tl_output_path(w->to->output));
     }
     if (status == TL_OK)
@@ -275,6 +304,7 @@ static tl_status write_tiles(writing *w, const tl_run *run, out_extent *extent, 
         if (w->workers[i].begun)
             exr_encoding_destroy(w->file, &w->workers[i].pipeline);
         free(w->workers[i].heights);
+        free(w->workers[i].halves);
     }
     free(w->workers);
     return status;
@@ -347,7 +377,11 @@ static tl_status write_exr(const tl_source *source, const out_planes *planes, tl
     start.error_handler_fn = on_error;
     start.user_data = &to;
     start.write_fn = on_write;
-    writing w = {.source = source, .planes = planes, .tiling = out_tiling_of(source), .to = &to};
+    writing w = {.source = source,
+                 .planes = planes,
+                 .tiling = out_tiling_of(source),
+                 .half_error = options->half_error,
+                 .to = &to};
     status = out_mip_init(&w.mip, options->mip, 1, source->info.width, source->info.height, options->run, path, error);
     if (status != TL_OK)
         return status;
@@ -380,5 +414,6 @@ tl_status out_exr_write_planes(const tl_source *source, const out_planes *planes
 {
     tl_write_options plain = *options;
     plain.mip = TL_MIP_NONE;
+    plain.half_error = 0;
     return write_exr(source, planes, output, &plain, error);
 }

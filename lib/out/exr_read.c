@@ -14,6 +14,8 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
+static const char heights_name[] = "Y";
+
 enum { PART = 0, TILE_LIMIT = 4096, PREFIX = 6 /* of "talus:" */ };
 
 typedef struct exr_source {
@@ -83,12 +85,14 @@ static exr_result_t decode_tile(const exr_source *self, decoding *d, int32_t x, 
                         : exr_decoding_initialize(self->file, PART, &chunk, &d->pipeline);
     if (code != EXR_ERR_SUCCESS)
         return code;
-    exr_coding_channel_info_t *channel = &d->pipeline.channels[0];
-    channel->decode_to_ptr = (uint8_t *)d->tile;
-    channel->user_pixel_stride = sizeof(float);
-    channel->user_line_stride = (int32_t)((size_t)tile_width * sizeof(float));
-    channel->user_bytes_per_element = sizeof(float);
-    channel->user_data_type = EXR_PIXEL_FLOAT;
+    for (int c = 0; c < d->pipeline.channel_count; c++) {
+        exr_coding_channel_info_t *channel = &d->pipeline.channels[c];
+        channel->decode_to_ptr = strcmp(channel->channel_name, heights_name) == 0 ? (uint8_t *)d->tile : NULL;
+        channel->user_pixel_stride = sizeof(float);
+        channel->user_line_stride = (int32_t)((size_t)tile_width * sizeof(float));
+        channel->user_bytes_per_element = sizeof(float);
+        channel->user_data_type = EXR_PIXEL_FLOAT;
+    }
     if (!d->begun)
         code = exr_decoding_choose_default_routines(self->file, PART, &d->pipeline);
     d->begun = true;
@@ -154,6 +158,41 @@ static const char *text_attribute(exr_const_context_t file, const char *name)
     return exr_attr_get_string(file, PART, name, &length, &text) == EXR_ERR_SUCCESS ? text : NULL;
 }
 
+/* A channel Y of floats or halves, among others that cover every sample too. */
+static bool has_heights(const exr_attr_chlist_t *channels)
+{
+    bool found = false;
+    for (int c = 0; c < channels->num_channels; c++) {
+        const exr_attr_chlist_entry_t *entry = &channels->entries[c];
+        if (entry->x_sampling != 1 || entry->y_sampling != 1)
+            return false;
+        found |= strcmp(entry->name.str, heights_name) == 0 && entry->pixel_type != EXR_PIXEL_UINT;
+    }
+    return found;
+}
+
+/* What the file says that its numbers are. */
+static const char *contents_of(const exr_source *self)
+{
+    const char *contents = text_attribute(self->file, "talus:contents");
+    if (!contents)
+        contents = text_attribute(self->file, "talus:layer"); /* of files before there were contents */
+    if (!contents || strcmp(contents, "heights") == 0)
+        return NULL;
+    tl_make_printable((char *)contents);
+    return contents;
+}
+
+static tl_status not_ours(const exr_source *self, tl_error *error)
+{
+    const char *contents = contents_of(self);
+    if (contents)
+        return tl_fail(error, TL_ERROR_DATA, "%s: holds %.60s, no heights; name the heightfield that it was made of",
+                       self->path, contents);
+    return tl_fail(error, TL_ERROR_DATA, "%s: not a heightfield of talus (one tiled part with a float channel Y)",
+                   self->path);
+}
+
 static bool is_ours(exr_source *self)
 {
     exr_storage_t storage;
@@ -162,8 +201,7 @@ static bool is_ours(exr_source *self)
     exr_tile_level_mode_t mode;
     exr_tile_round_mode_t rounding;
     if (exr_get_storage(self->file, PART, &storage) != EXR_ERR_SUCCESS || storage != EXR_STORAGE_TILED ||
-        exr_get_channels(self->file, PART, &channels) != EXR_ERR_SUCCESS || channels->num_channels != 1 ||
-        strcmp(channels->entries[0].name.str, "Y") != 0 || channels->entries[0].pixel_type != EXR_PIXEL_FLOAT ||
+        exr_get_channels(self->file, PART, &channels) != EXR_ERR_SUCCESS || !has_heights(channels) ||
         exr_get_tile_descriptor(self->file, PART, &width, &height, &mode, &rounding) != EXR_ERR_SUCCESS)
         return false;
     self->tile_width = (int32_t)width;
@@ -200,7 +238,8 @@ static tl_status read_parameters(exr_source *self, tl_error *error)
     for (int32_t i = 0; i < count; i++) {
         const exr_attribute_t *a;
         if (exr_get_attribute_by_index(self->file, PART, EXR_ATTR_LIST_FILE_ORDER, i, &a) == EXR_ERR_SUCCESS &&
-            a->type == EXR_ATTR_STRING && strncmp(a->name, "talus:", PREFIX) == 0) {
+            a->type == EXR_ATTR_STRING && strncmp(a->name, "talus:", PREFIX) == 0 &&
+            strcmp(a->name + PREFIX, "contents") != 0) {
             /* anyone may have written the file; the text lies in memory of the context, which is ours */
             tl_make_printable((char *)a->name);
             tl_make_printable((char *)a->string->str);
@@ -223,8 +262,7 @@ static tl_status read_header(exr_source *self, tl_error *error)
     if (code != EXR_ERR_SUCCESS)
         return damaged(self, code, error);
     if (!is_ours(self))
-        return tl_fail(error, TL_ERROR_DATA, "%s: not a heightfield of talus (one tiled part with one float channel Y)",
-                       self->path);
+        return not_ours(self, error);
     exr_attr_box2i_t box;
     code = exr_get_data_window(self->file, PART, &box);
     if (code != EXR_ERR_SUCCESS)
@@ -233,6 +271,7 @@ static tl_status read_header(exr_source *self, tl_error *error)
     info->width = (int64_t)box.max.x - box.min.x + 1;
     info->height = (int64_t)box.max.y - box.min.y + 1;
     info->name = self->path;
+    info->contents = contents_of(self);
     info->block_width = self->tile_width;
     info->block_height = self->tile_height;
     info->has_voids = true;

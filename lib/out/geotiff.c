@@ -118,6 +118,8 @@ static bool set_metadata(TIFF *tiff, const tl_source_info *info, const out_packi
     size_t used = (size_t)snprintf(text, METADATA_LIMIT, "<GDALMetadata>\n");
     for (size_t i = 0; i < info->parameter_count && used + 1024 < METADATA_LIMIT; i++)
         append_item(text, &used, info->parameters[i].name, info->parameters[i].value);
+    if (info->contents)
+        append_item(text, &used, "contents", info->contents);
     if (packing->lerc_error > 0) {
         char number[TL_NUMBER_TEXT];
         tl_number_text(packing->lerc_error, number);
@@ -305,7 +307,7 @@ static bool set_directory(TIFF *tiff, const tl_source_info *info, const out_pack
     if (good && info->georef.located)
         good = set_transform(tiff, info);
     good = good && set_keys(tiff, info); /* also without a place: the raster type is a key */
-    bool record = info->parameter_count > 0 || packing->lerc_error > 0;
+    bool record = info->parameter_count > 0 || info->contents || packing->lerc_error > 0;
     return good && (!record || set_metadata(tiff, info, packing));
 }
 

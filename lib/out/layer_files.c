@@ -9,10 +9,19 @@
 #include "lib/scene/north_up.h"
 
 #include <math.h>
+#include <stdio.h>
 #include <string.h>
 #include <strings.h>
 
 /* ---- A channel as a source ---- */
+
+static const tl_layer_kind *kind_of(const char *name)
+{
+    const tl_layer_kind *kind = tl_layers();
+    while (kind->name && strcmp(kind->name, name) != 0)
+        kind++;
+    return kind->name ? kind : NULL;
+}
 
 typedef struct layer_source {
     tl_source source;
@@ -58,6 +67,7 @@ tl_source *tl_layer_create(const tl_source *heights, const char *kind, size_t ch
     info->georef.height_unit = 1;
     l->channel = channel;
     l->layer = scene_layer_create(heights, kind, options, error);
+    info->contents = l->layer ? scene_layer_kind(l->layer)->name : NULL;
     tl_status status = l->layer ? TL_OK : TL_ERROR_ARGUMENT;
     if (l->layer && channel >= scene_layer_kind(l->layer)->channels)
         status = tl_fail(error, TL_ERROR_ARGUMENT, "layer %s has %zu channels, not %zu", kind,
@@ -148,6 +158,7 @@ static tl_status write_exr(const tl_source *heights, scene_layer *layer, tl_outp
     const tl_layer_kind *kind = scene_layer_kind(layer);
     out_planes planes = {.count = kind->channels, .names = kind->channel_names, .read = read_planes, .context = layer};
     tl_source record = *heights; /* with what the file is */
+    record.info.contents = kind->name;
     tl_parameter *parameters = tl_parameters_copy(heights->info.parameters, heights->info.parameter_count);
     tl_status status = TL_OK;
     if (heights->info.parameter_count && !parameters)
@@ -200,12 +211,10 @@ static tl_status write_scalar(const tl_source *heights, const char *kind, const 
     return status;
 }
 
-static const tl_layer_kind *kind_of(const char *name)
+/* Whether its rows and columns run as a picture's, or are turned so that nothing helps. */
+static bool is_upright(const double *t)
 {
-    const tl_layer_kind *kind = tl_layers();
-    while (kind->name && strcmp(kind->name, name) != 0)
-        kind++;
-    return kind->name ? kind : NULL;
+    return t[2] != 0 || t[4] != 0 || (t[1] > 0 && t[5] < 0);
 }
 
 tl_status tl_write_layer(const tl_source *heights, const char *kind, const char *path, const tl_layer_options *options,
@@ -221,11 +230,123 @@ tl_status tl_write_layer(const tl_source *heights, const char *kind, const char 
                        "%s: layers are written as .exr or .png, and those of one value a sample as .tif", path);
     if (!picture && found && found->channels == 1)
         return write_scalar(heights, kind, path, options, error);
-    const double *t = heights->info.georef.transform;
-    if (t[2] != 0 || t[4] != 0 || (t[1] > 0 && t[5] < 0))
+    if (is_upright(heights->info.georef.transform))
         return write_channels(heights, kind, path, options, error);
     tl_source *upright = scene_north_up(heights, error);
     tl_status status = upright ? write_channels(upright, kind, path, options, error) : TL_ERROR_MEMORY;
     tl_source_destroy(upright);
+    return status;
+}
+
+/* ---- All in one ---- */
+
+enum { MOST_KINDS = 16, NAME_ROOM = 32 };
+
+/* Heights, and what is made of them, as channels. */
+typedef struct collection {
+    const tl_source *heights;
+    scene_layer *layers[MOST_KINDS];
+    size_t count, channels;
+    char names[1 + MOST_KINDS * SCENE_LAYER_CHANNELS][NAME_ROOM];
+    const char *name_list[1 + MOST_KINDS * SCENE_LAYER_CHANNELS];
+} collection;
+
+static tl_status read_collection(void *context, tl_window window, float *out, tl_error *error)
+{
+    const collection *c = context;
+    size_t samples = (size_t)(window.width * window.height);
+    tl_status status = tl_source_read(c->heights, c->heights->info.level, window, out, error);
+    for (size_t k = 0; k < c->count && status == TL_OK; k++) {
+        out += samples * (k ? scene_layer_kind(c->layers[k - 1])->channels : 1);
+        status = scene_layer_read(c->layers[k], window, out, error);
+    }
+    return status;
+}
+
+static void name_channel(collection *c, const char *layer, const char *channel)
+{
+    snprintf(c->names[c->channels], NAME_ROOM, "%s%s%s", layer, *layer ? "." : "", channel);
+    c->name_list[c->channels] = c->names[c->channels];
+    c->channels++;
+}
+
+static tl_status add_layer(collection *c, const tl_source *surface, const char *name, const tl_layer_options *options,
+                           tl_error *error)
+{
+    for (size_t k = 0; k < c->count; k++)
+        if (strcmp(scene_layer_kind(c->layers[k])->name, name) == 0)
+            return tl_fail(error, TL_ERROR_ARGUMENT, "the layer %.60s is asked for twice", name);
+    if (c->count == MOST_KINDS)
+        return tl_fail(error, TL_ERROR_ARGUMENT, "at most %d layers go into one file", MOST_KINDS);
+    scene_layer *layer = scene_layer_create(surface, name, options, error);
+    if (!layer)
+        return TL_ERROR_ARGUMENT;
+    c->layers[c->count++] = layer;
+    const tl_layer_kind *kind = scene_layer_kind(layer);
+    for (size_t k = 0; k < kind->channels; k++)
+        name_channel(c, kind->name, kind->channels > 1 ? kind->channel_names[k] : "Y");
+    return TL_OK;
+}
+
+static tl_status write_collection(collection *c, tl_output *output, const tl_layer_options *options, tl_error *error)
+{
+    const out_planes planes = {.count = c->channels, .names = c->name_list, .read = read_collection, .context = c};
+    const tl_write_options writing = {.compression = options->compression, .run = options->run};
+    char list[MOST_KINDS * NAME_ROOM] = "";
+    for (size_t k = 0, used = 0; k < c->count; k++)
+        used += (size_t)snprintf(list + used, sizeof list - used, "%s%s", k ? "," : "",
+                                 scene_layer_kind(c->layers[k])->name);
+    tl_source record = *c->heights;
+    tl_parameter *parameters = tl_parameters_copy(record.info.parameters, record.info.parameter_count);
+    if (record.info.parameter_count && !parameters)
+        return tl_fail_memory(error, record.info.name);
+    tl_status status = tl_parameters_add(&parameters, &record.info.parameter_count, "layers", list, error);
+    record.info.parameters = parameters;
+    if (status == TL_OK)
+        status = out_exr_write_planes(&record, &planes, output, &writing, error);
+    free(parameters);
+    return status;
+}
+
+static tl_status collect(const tl_source *heights, const tl_source *surface, const char *const *kinds, size_t count,
+                         const char *path, const tl_layer_options *options, tl_error *error)
+{
+    collection *c = calloc(1, sizeof *c);
+    tl_output *output = NULL;
+    tl_status status = c ? TL_OK : tl_fail_memory(error, path);
+    if (c) {
+        c->heights = heights;
+        name_channel(c, "", "Y");
+    }
+    for (size_t k = 0; k < count && status == TL_OK; k++)
+        status = add_layer(c, surface, kinds[k], options, error);
+    if (status == TL_OK) {
+        output = tl_output_open(path, options->overwrite, error);
+        status = output ? write_collection(c, output, options, error) : TL_ERROR_IO;
+    }
+    if (status == TL_OK)
+        status = tl_output_commit(output, error);
+    else
+        tl_output_abort(output);
+    for (size_t k = 0; c && k < c->count; k++)
+        scene_layer_destroy(c->layers[k]);
+    free(c);
+    return status;
+}
+
+tl_status tl_write_layers(const tl_source *heights, const tl_source *surface, const char *const *kinds, size_t count,
+                          const char *path, const tl_layer_options *options, tl_error *error)
+{
+    const tl_layer_options defaults = {0};
+    options = options ? options : &defaults;
+    surface = surface ? surface : heights;
+    if (!ends_with(path, "exr"))
+        return tl_fail(error, TL_ERROR_ARGUMENT, "%s: only an .exr holds heights and layers in one file", path);
+    if (is_upright(heights->info.georef.transform))
+        return collect(heights, surface, kinds, count, path, options, error);
+    tl_source *turned = scene_north_up(heights, error), *below = turned ? scene_north_up(surface, error) : NULL;
+    tl_status status = below ? collect(turned, below, kinds, count, path, options, error) : TL_ERROR_MEMORY;
+    tl_source_destroy(below);
+    tl_source_destroy(turned);
     return status;
 }

@@ -23,6 +23,7 @@ static tl_status write_depth(const scene_painter *painter, const tl_mesh *mesh, 
                                  .height = (int64_t)c->height,
                                  .georef = tl_georef_none(),
                                  .has_voids = true,
+                                 .contents = "depth",
                                  .name = o->depth};
     tl_source *source = tl_array_source_create(depth, &info, error);
     status = source
