@@ -21,6 +21,8 @@ enum { FRAME = TL_BLOCK + 3, LAST = TL_BLOCK };
 
 /* Bytes a sample of the bitmaps of the pyramid's shape and of one framework. */
 static const double BITMAPS = 0.5;
+/* What tl_pyramid.overview and tl_pyramid.squares take of a sample. */
+static const double OVERVIEW = 4. / 64 + 12. / 256;
 
 /* What the first pass finds of a block. */
 typedef struct block_facts {
@@ -163,6 +165,38 @@ static tl_status look_at_rises(const builder *self, const block_place *at, scrat
     return status;
 }
 
+static void note_overview(const builder *self, const block_place *at, const float *z)
+{
+    tl_pyramid *to = self->pyramid;
+    const int64_t step = INT64_C(1) << TL_OVERVIEW_LOG;
+    bool last_column = at->column == self->shape->columns - 1, last_row = at->row == self->shape->rows - 1;
+    for (int64_t j = 0; j < self->side + last_row && j <= at->height; j += step)
+        for (int64_t i = 0; i < self->side + last_column && i <= at->width; i += step)
+            to->overview[(at->y + j) / step * to->overview_columns + (at->x + i) / step] = z[j * (at->width + 1) + i];
+}
+
+static void note_square(const block_place *at, const float *z, int64_t x, int64_t y, tl_square_facts *out)
+{
+    const int64_t side = INT64_C(1) << TL_SQUARE_LOG;
+    *out = (tl_square_facts){HUGE_VALF, -HUGE_VALF, false};
+    for (int64_t j = y; j <= y + side && j <= at->height; j++)
+        for (int64_t i = x; i <= x + side && i <= at->width; i++) {
+            float here = z[j * (at->width + 1) + i];
+            out->low = here < out->low ? here : out->low; /* false for a void */
+            out->high = here > out->high ? here : out->high;
+            out->voids |= here != here;
+        }
+}
+
+static void note_squares(const builder *self, const block_place *at, const float *z)
+{
+    tl_pyramid *to = self->pyramid;
+    const int64_t side = INT64_C(1) << TL_SQUARE_LOG;
+    for (int64_t y = 0; y < at->height; y += side)
+        for (int64_t x = 0; x < at->width; x += side)
+            note_square(at, z, x, y, &to->squares[(at->y + y) / side * to->square_columns + (at->x + x) / side]);
+}
+
 static tl_status look_at_block(void *context, tl_parallel *loop, uint64_t item, unsigned worker, tl_error *error)
 {
     builder *self = context;
@@ -178,6 +212,8 @@ static tl_status look_at_block(void *context, tl_parallel *loop, uint64_t item, 
     found->hash = hash_block(own->read, &at, tl_int64_min(self->side, self->width - at.x),
                              tl_int64_min(self->side, self->height - at.y));
     find_range(own->read, of.width * of.height, found);
+    note_overview(self, &at, own->read);
+    note_squares(self, &at, own->read);
     if (self->only_looks)
         return TL_OK;
     found->rounds = tl_heights_round(&of, found->magnitude, self->shape->lattice_log);
@@ -720,7 +756,7 @@ static tl_status build(builder *self, tl_error *error)
 tl_pyramid *tl_pyramid_allocate(const tl_source_info *info, const tl_pyramid_options *options, tl_error *error)
 {
     double samples = (double)info->width * (double)info->height;
-    if (tl_run_fits(options->run, ((options->exact ? sizeof(float) : 1) + BITMAPS) * samples, info->name,
+    if (tl_run_fits(options->run, ((options->exact ? sizeof(float) : 1) + BITMAPS + OVERVIEW) * samples, info->name,
                     "its error pyramid", error) != TL_OK)
         return NULL;
     tl_pyramid *pyramid = calloc(1, sizeof *pyramid);
@@ -737,7 +773,15 @@ tl_pyramid *tl_pyramid_allocate(const tl_source_info *info, const tl_pyramid_opt
         pyramid->errors = options->exact ? calloc(count, sizeof *pyramid->errors) : NULL;
         size_t blocks = (size_t)(pyramid->shape->columns * pyramid->shape->rows);
         pyramid->ranges = tl_alloc(blocks, 2 * sizeof *pyramid->ranges);
-        if ((pyramid->codes || pyramid->errors) && pyramid->ranges)
+        pyramid->overview_columns = (info->width - 1) / (1 << TL_OVERVIEW_LOG) + 1;
+        pyramid->overview_rows = (info->height - 1) / (1 << TL_OVERVIEW_LOG) + 1;
+        pyramid->square_columns = tl_div_up(info->width - 1, 1 << TL_SQUARE_LOG);
+        pyramid->square_rows = tl_div_up(info->height - 1, 1 << TL_SQUARE_LOG);
+        pyramid->overview =
+            tl_alloc_grid(pyramid->overview_columns, pyramid->overview_rows, sizeof *pyramid->overview);
+        pyramid->squares = calloc((size_t)(pyramid->square_columns * pyramid->square_rows + 1),
+                                  sizeof *pyramid->squares);
+        if ((pyramid->codes || pyramid->errors) && pyramid->ranges && pyramid->overview && pyramid->squares)
             return pyramid;
         tl_fail(error, TL_ERROR_MEMORY, "%s: not enough memory for the errors of its %lld x %lld samples", info->name,
                 (long long)info->width, (long long)info->height);
@@ -799,5 +843,7 @@ void tl_pyramid_destroy(tl_pyramid *pyramid)
     free(pyramid->codes);
     free(pyramid->errors);
     free(pyramid->ranges);
+    free(pyramid->overview);
+    free(pyramid->squares);
     free(pyramid);
 }

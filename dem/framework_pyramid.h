@@ -6,6 +6,15 @@
 
 #include <math.h>
 
+/* What views know of the raster without reading it again: the heights of every eighth sample of every eighth row, and
+ * of squares of 16 x 16 cells the range of heights, rims included, and whether there are voids. A tenth of a byte a
+ * sample. */
+enum { TL_OVERVIEW_LOG = 3, TL_SQUARE_LOG = 4 };
+typedef struct tl_square_facts {
+    float low, high; /* low > high: all void */
+    bool voids;
+} tl_square_facts;
+
 struct tl_pyramid {
     tl_framework *shape; /* without marks: the raster's description and the lattice's */
     tl_frame frame;
@@ -15,6 +24,9 @@ struct tl_pyramid {
     int32_t base;      /* of the codes: see tl_error_kernel */
     uint64_t checksum; /* of the DEM's heights */
     float *ranges;     /* lowest and highest height of each of the shape's blocks, rims included; low > high: void */
+    int64_t overview_columns, overview_rows, square_columns, square_rows;
+    float *overview;
+    tl_square_facts *squares;
 };
 
 /* Keys are codes, or the bits of errors: ordered as errors are. */

@@ -106,7 +106,7 @@ tl_status lod_init(lod *l, const tl_source *field, const tl_source *dem, const t
     bool alone = !(options->budget || options->band_count);
     l->pixel_error = options->pixel_error > 0 ? options->pixel_error : alone ? 1 : 0;
     l->empty = !find_range(l);
-    l->tiles = scene_tiles_create(field, dem, l->levels, options->run, error);
+    l->tiles = scene_tiles_create(field, dem, pyramid, l->levels, options->run, error);
     return l->tiles ? TL_OK : TL_ERROR_MEMORY;
 }
 

@@ -159,8 +159,8 @@ tl_status lod_ridges_create(lod *l, lod_ridges **out, tl_error *error);
 void lod_ridges_destroy(lod_ridges *ridges);
 /* Whether it found the square of 2^log cells at cell (i, j) to be hidden. (Those in a hidden square are not known.) */
 bool lod_ridges_hide(const lod_ridges *ridges, int64_t i, int64_t j, int log);
-/* The range of the model's heights in a rectangle of cells, by what the pyramid knows. */
-void lod_wide_range(const lod *l, int64_t i0, int64_t j0, int64_t i1, int64_t j1, double *low, double *high);
+/* The range of the model's heights in a rectangle of cells, by what the pyramid knows; whether it may have voids. */
+bool lod_wide_range(const lod *l, int64_t i0, int64_t j0, int64_t i1, int64_t j1, double *low, double *high);
 
 /* ---- lod_marks.c: vertices ---- */
 

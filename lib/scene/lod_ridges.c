@@ -1,5 +1,6 @@
 /* What nearer ground hides: squares of cells, gone over from near to far, that are either hidden or hide what is behind
  * them. Only blocks that are not hidden are read. */
+#include "dem/framework_pyramid.h"
 #include "lib/base/error.h"
 #include "lib/base/size.h"
 #include "lib/scene/lod.h"
@@ -167,6 +168,12 @@ static bool is_hidden(const sweep *self, const square *s, scene_extent *extent)
     return scene_skyline_hides(self->skyline, self->l->view, extent, &box);
 }
 
+/* Whether it is to be divided into squares smaller than those that the pyramid knows. */
+static bool needs_block(const lod *l, const square *s)
+{
+    return side_of(l, s) > SMALL * s->distance * (1 << (SCENE_TILE_LOG - TL_SQUARE_LOG));
+}
+
 /* Squares first ... end - 1 of `wide`: reads those blocks that are not hidden. */
 static tl_status read_batch(sweep *self, size_t first, size_t end, tl_error *error)
 {
@@ -178,7 +185,7 @@ static tl_status read_batch(sweep *self, size_t first, size_t end, tl_error *err
         if (is_hidden(self, &squares[k], &extent)) {
             status = hide(self->out, &squares[k], error);
             squares[k].log = -1;
-        } else if (squares[k].log == SCENE_TILE_LOG)
+        } else if (squares[k].log == SCENE_TILE_LOG && needs_block(l, &squares[k]))
             status = scene_tiles_want_block(l->tiles, squares[k].i, squares[k].j, &squares[k].block, error);
     }
     return status == TL_OK ? scene_tiles_make(l->tiles, l->run, error) : status;
@@ -187,9 +194,13 @@ static tl_status read_batch(sweep *self, size_t first, size_t end, tl_error *err
 /* Whether a square may have voids. What is beyond the raster's rim is none: nobody sees through there. */
 static bool has_holes(const lod *l, const square *s)
 {
-    if (!l->voids || s->block == LOD_NONE)
-        return l->voids;
+    int64_t side = INT64_C(1) << s->log;
+    double low, high;
     scene_cells cells;
+    if (!l->voids)
+        return false;
+    if (s->block == LOD_NONE)
+        return lod_wide_range(l, s->i, s->j, s->i + side, s->j + side, &low, &high);
     scene_block_at(l->tiles, s->block, s->i, s->j, s->log, &cells);
     return cells.voids;
 }
@@ -208,7 +219,7 @@ static tl_status go_over_batch(sweep *self, size_t first, size_t end, tl_error *
     self->fine.count = 0;
     for (size_t k = first; k < end && status == TL_OK; k++)
         if (squares[k].log >= 0)
-            status = divide(self, squares[k], squares[k].block == LOD_NONE ? squares[k].log : LOD_RIDGE_LOG,
+            status = divide(self, squares[k], squares[k].block == LOD_NONE ? TL_SQUARE_LOG : LOD_RIDGE_LOG,
                             &self->fine, error);
     sort(&self->fine);
     for (size_t k = 0; k < self->fine.count && status == TL_OK; k++) {

@@ -166,24 +166,45 @@ typedef struct subject {
     scene_cells cells;
 } subject;
 
-void lod_wide_range(const lod *l, int64_t i0, int64_t j0, int64_t i1, int64_t j1, double *low, double *high)
+/* Squares of 2^log cells that a rectangle of cells shares some with: their number, and from ... to. */
+static int64_t squares_under(const int64_t cells[4], int64_t side, int64_t columns, int64_t rows, int64_t out[4])
 {
-    const tl_framework *shape = l->pyramid->shape;
-    int64_t side = shape->block, columns = shape->columns, rows = shape->rows;
-    i0 = tl_int64_min(i0 / side, columns - 1), i1 = tl_int64_min((i1 - 1) / side, columns - 1);
-    j0 = tl_int64_min(j0 / side, rows - 1), j1 = tl_int64_min((j1 - 1) / side, rows - 1);
-    *low = (double)l->low, *high = (double)l->high;
-    if ((i1 - i0 + 1) * (j1 - j0 + 1) > 4)
-        return;
+    out[0] = tl_int64_min(cells[0] / side, columns - 1), out[2] = tl_int64_min((cells[2] - 1) / side, columns - 1);
+    out[1] = tl_int64_min(cells[1] / side, rows - 1), out[3] = tl_int64_min((cells[3] - 1) / side, rows - 1);
+    return (out[2] - out[0] + 1) * (out[3] - out[1] + 1);
+}
+
+bool lod_wide_range(const lod *l, int64_t i0, int64_t j0, int64_t i1, int64_t j1, double *low, double *high)
+{
+    enum { FEW_BLOCKS = 4, FEW_SQUARES = 36 };
+    const tl_pyramid *p = l->pyramid;
+    const tl_framework *shape = p->shape;
+    const int64_t cells[4] = {i0, j0, i1, j1};
+    int64_t at[4];
     double least_z = HUGE_VAL, most_z = -HUGE_VAL;
-    for (int64_t j = j0; j <= j1; j++)
-        for (int64_t i = i0; i <= i1; i++) {
-            const float *range = l->pyramid->ranges + 2 * (j * columns + i);
-            least_z = fmin(least_z, (double)range[0]);
-            most_z = fmax(most_z, (double)range[1]);
-        }
+    bool voids = false;
+    *low = (double)l->low, *high = (double)l->high;
+    if (squares_under(cells, 1 << TL_SQUARE_LOG, p->square_columns, p->square_rows, at) <= FEW_SQUARES) {
+        for (int64_t j = at[1]; j <= at[3]; j++)
+            for (int64_t i = at[0]; i <= at[2]; i++) {
+                const tl_square_facts *facts = p->squares + j * p->square_columns + i;
+                least_z = fmin(least_z, (double)facts->low);
+                most_z = fmax(most_z, (double)facts->high);
+                voids |= facts->voids;
+            }
+    } else if (squares_under(cells, shape->block, shape->columns, shape->rows, at) <= FEW_BLOCKS) {
+        for (int64_t j = at[1]; j <= at[3]; j++)
+            for (int64_t i = at[0]; i <= at[2]; i++) {
+                const float *range = p->ranges + 2 * (j * shape->columns + i);
+                least_z = fmin(least_z, (double)range[0]);
+                most_z = fmax(most_z, (double)range[1]);
+            }
+        voids = l->voids;
+    } else
+        return l->voids;
     if (least_z <= most_z)
         *low = least_z, *high = most_z;
+    return voids;
 }
 
 static const scene_cells wide_cells = {.strength = WIDE_STRENGTH, .rise = HUGE_VALF, .low = 1};

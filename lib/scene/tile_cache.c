@@ -1,6 +1,6 @@
 #include "lib/scene/tile_cache.h"
 
-#include "dem/framework.h"
+#include "dem/framework_pyramid.h"
 #include "lib/base/error.h"
 #include "lib/base/parallel.h"
 #include "lib/base/size.h"
@@ -32,15 +32,9 @@ typedef struct table {
     size_t room, count; /* room: a power of two, or 0 */
 } table;
 
-/* A sample of the model that was asked for alone. */
-typedef struct single {
-    scene_tile *tile;
-    uint32_t at;
-    int32_t i, j;
-} single;
-
 struct scene_tiles {
     const tl_source *field, *dem;
+    const tl_pyramid *pyramid;
     int levels;
     size_t memory; /* bytes; 0: any */
     table tiles;
@@ -49,8 +43,6 @@ struct scene_tiles {
     table block_table; /* of `numbered` */
     scene_tile **pending;
     size_t pending_count, pending_room;
-    single *singles;
-    size_t single_count, single_room;
     uint64_t clock;
     scene_tile_counts counts;
     int64_t dem_columns, dem_rows; /* of blocks of the model */
@@ -114,8 +106,8 @@ static bool table_grow(table *t)
 
 /* ---- Life ---- */
 
-scene_tiles *scene_tiles_create(const tl_source *field, const tl_source *dem, int levels, const tl_run *run,
-                                tl_error *error)
+scene_tiles *scene_tiles_create(const tl_source *field, const tl_source *dem, const tl_pyramid *pyramid, int levels,
+                                const tl_run *run, tl_error *error)
 {
     scene_tiles *t = calloc(1, sizeof *t);
     if (!t) {
@@ -124,6 +116,7 @@ scene_tiles *scene_tiles_create(const tl_source *field, const tl_source *dem, in
     }
     t->field = field;
     t->dem = dem;
+    t->pyramid = pyramid;
     t->levels = levels;
     t->memory = run ? run->memory : 0;
     int64_t width = dem->info.block_width ? dem->info.block_width : NOMINAL_BLOCK;
@@ -152,7 +145,6 @@ void scene_tiles_destroy(scene_tiles *t)
     free(t->block_table.items);
     free(t->blocks);
     free(t->pending);
-    free(t->singles);
     free(t->touched);
     free(t);
 }
@@ -212,8 +204,10 @@ static inline uint64_t place_of(const scene_tiles *t, int32_t x, int32_t y, uint
 {
     uint32_t both = (uint32_t)x | (uint32_t)y;
     int stage = both ? __builtin_ctz(both) : 30, level = t->levels - stage;
-    if (level <= 0)
-        level = -level / SCENE_TILE_LOG * -SCENE_TILE_LOG;
+    if (level <= -TL_OVERVIEW_LOG)
+        level = -TL_OVERVIEW_LOG - (-level - TL_OVERVIEW_LOG) / SCENE_TILE_LOG * SCENE_TILE_LOG;
+    else if (level < 0)
+        level = 0;
     int shift = t->levels - level;
     uint32_t i = (uint32_t)x >> shift, j = (uint32_t)y >> shift;
     *at = (j & (SCENE_TILE - 1)) << SCENE_TILE_LOG | (i & (SCENE_TILE - 1));
@@ -266,33 +260,26 @@ size_t scene_tiles_bytes(const scene_tiles *t)
     return t->tiles.count * sizeof(scene_tile) + t->block_count * sizeof(scene_block);
 }
 
-/* A height that was not asked for yet: a NaN that no source gives. */
-static const uint32_t NOT_ASKED = UINT32_C(0x7fc0dead);
+/* Tiles below level 0 are parts of the pyramid's overview. */
+static void fill_by_overview(const scene_tiles *t, scene_tile *tile)
+{
+    const tl_pyramid *p = t->pyramid;
+    int shift = -key_level(tile->key) - TL_OVERVIEW_LOG;
+    for (int64_t k = 0; k < SCENE_TILE_SLOTS; k++) {
+        int64_t x = ((key_x(tile->key) << SCENE_TILE_LOG) + k % SCENE_TILE) << shift;
+        int64_t y = ((key_y(tile->key) << SCENE_TILE_LOG) + k / SCENE_TILE) << shift;
+        tile->slots[k].z =
+            x < p->overview_columns && y < p->overview_rows ? p->overview[y * p->overview_columns + x] : NAN;
+    }
+    tile->made = true;
+}
 
 static tl_status add_tile(scene_tiles *t, uint64_t key, scene_tile **out, tl_error *error)
 {
     if (!table_grow(&t->tiles) || !(*out = malloc(sizeof **out)))
         return tl_fail_memory(error, "the view's tiles");
     **out = (scene_tile){.key = key};
-    for (int k = 0; k < SCENE_TILE_SLOTS; k++)
-        (*out)->slots[k].vertex = NOT_ASKED;
     table_put(&t->tiles, *out);
-    return TL_OK;
-}
-
-/* Asks for one sample of a tile below level 0; beyond the raster there is nothing to ask for. */
-static tl_status want_single(scene_tiles *t, scene_slot slot, int32_t x, int32_t y, tl_error *error)
-{
-    if (scene_slot_marked(slot) || slot.tile->slots[slot.at].vertex != NOT_ASKED)
-        return TL_OK;
-    slot.tile->slots[slot.at].z = NAN;
-    int64_t i = (int64_t)x >> t->levels, j = (int64_t)y >> t->levels;
-    if (i >= t->dem->info.width || j >= t->dem->info.height)
-        return TL_OK;
-    if (!grow((void **)&t->singles, t->single_count, &t->single_room, sizeof *t->singles))
-        return tl_fail_memory(error, "the view's tiles");
-    t->singles[t->single_count++] = (single){slot.tile, slot.at, (int32_t)i, (int32_t)j};
-    count_dem(t, (tl_window){i, j, 1, 1});
     return TL_OK;
 }
 
@@ -310,10 +297,10 @@ tl_status scene_tiles_want(scene_tiles *t, int32_t x, int32_t y, scene_slot *out
                 return tl_fail_memory(error, "the view's tiles");
             t->pending[t->pending_count++] = out->tile;
         } else
-            out->tile->made = true;
+            fill_by_overview(t, out->tile);
     }
     out->tile->wanted = t->clock;
-    return key_level(key) < 0 ? want_single(t, *out, x, y, error) : TL_OK;
+    return TL_OK;
 }
 
 tl_status scene_tiles_want_block(scene_tiles *t, int64_t i, int64_t j, uint32_t *block, tl_error *error)
@@ -560,14 +547,7 @@ static tl_status make_item(void *context, tl_parallel *loop, uint64_t item, unsi
     if (item < blocks)
         return make_block(t, t->blocks[t->made_blocks + item], error);
     item -= blocks;
-    if (item < t->pending_count)
-        return make_tile(t, t->pending[item], error);
-    const single *s = &t->singles[item - t->pending_count];
-    float z = NAN;
-    tl_status status = tl_source_read(t->dem, 0, (tl_window){s->i, s->j, 1, 1}, &z, error);
-    tl_heights_clean(&z, 1);
-    s->tile->slots[s->at].z = z;
-    return status;
+    return make_tile(t, t->pending[item], error);
 }
 
 /* Drops tiles without marks that were not wanted since the last time. */
@@ -615,7 +595,7 @@ static void count_wanted(scene_tiles *t)
 
 tl_status scene_tiles_make(scene_tiles *t, const tl_run *run, tl_error *error)
 {
-    uint64_t items = t->block_count - t->made_blocks + t->pending_count + t->single_count;
+    uint64_t items = t->block_count - t->made_blocks + t->pending_count;
     tl_status status = make_room(t, error);
     t->clock++;
     if (status != TL_OK || !items)
@@ -625,6 +605,6 @@ tl_status scene_tiles_make(scene_tiles *t, const tl_run *run, tl_error *error)
     quiet.progress = NULL;
     status = tl_parallel_for(&quiet, items, 0, make_item, t, error);
     t->made_blocks = t->block_count;
-    t->pending_count = t->single_count = 0;
+    t->pending_count = 0;
     return status;
 }

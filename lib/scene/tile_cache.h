@@ -2,9 +2,9 @@
  * that a mesh has; and what is known of the ground in blocks of 64 x 64 cells of the elevation model.
  *
  * Vertices are named by column and row on the lattice of level `levels`, the finest that is used: (x, y) is sample
- * (x, y) / 2^levels of the model. A vertex of a level above 0 lies in a tile of that level; those of level 0 and of the
- * five before it lie in tiles of level 0, those of the next six in tiles of level -6, of which only the samples that
- * are wanted are read, and so on. */
+ * (x, y) / 2^levels of the model. A vertex of a level above 0 lies in a tile of that level; those of levels 0 to -2 lie
+ * in tiles of level 0, those of the next six in tiles of level -3, and so on: these come from the pyramid's overview, so
+ * that coarse triangles, which reach over the rim of what is seen, have nothing read. */
 #ifndef SCENE_TILE_CACHE_H
 #define SCENE_TILE_CACHE_H
 
@@ -20,7 +20,7 @@ typedef struct scene_tile {
     uint32_t marked; /* number of marks; one with any stays */
     uint64_t wanted; /* when it was last wanted */
     uint64_t marks[SCENE_TILE];
-    /* Of a marked vertex its index, of the others the height; in tiles below level 0 also bits of `asked`. */
+    /* Of a marked vertex its index, of the others the height. */
     union {
         float z;
         uint32_t vertex;
@@ -54,9 +54,9 @@ typedef struct scene_tile_counts {
     uint64_t tiles_made, tiles_used, samples_made, dem_blocks, dem_samples;
 } scene_tile_counts;
 
-/* `field` is one of tl_field_create over `dem`, whose samples nest. levels <= field->info.level. Borrows both. */
-scene_tiles *scene_tiles_create(const tl_source *field, const tl_source *dem, int levels, const tl_run *run,
-                                tl_error *error);
+/* `field` is one of tl_field_create over `dem`, whose samples nest. levels <= field->info.level. Borrows all three. */
+scene_tiles *scene_tiles_create(const tl_source *field, const tl_source *dem, const tl_pyramid *pyramid, int levels,
+                                const tl_run *run, tl_error *error);
 void scene_tiles_destroy(scene_tiles *tiles);
 
 /* The vertex in its tile; the tile is NULL where there is none yet. `last`, of the caller's thread, makes it faster;
