@@ -777,10 +777,9 @@ tl_pyramid *tl_pyramid_allocate(const tl_source_info *info, const tl_pyramid_opt
         pyramid->overview_rows = (info->height - 1) / (1 << TL_OVERVIEW_LOG) + 1;
         pyramid->square_columns = tl_div_up(info->width - 1, 1 << TL_SQUARE_LOG);
         pyramid->square_rows = tl_div_up(info->height - 1, 1 << TL_SQUARE_LOG);
-        pyramid->overview =
-            tl_alloc_grid(pyramid->overview_columns, pyramid->overview_rows, sizeof *pyramid->overview);
-        pyramid->squares = calloc((size_t)(pyramid->square_columns * pyramid->square_rows + 1),
-                                  sizeof *pyramid->squares);
+        pyramid->overview = tl_alloc_grid(pyramid->overview_columns, pyramid->overview_rows, sizeof *pyramid->overview);
+        pyramid->squares =
+            calloc((size_t)(pyramid->square_columns * pyramid->square_rows + 1), sizeof *pyramid->squares);
         if ((pyramid->codes || pyramid->errors) && pyramid->ranges && pyramid->overview && pyramid->squares)
             return pyramid;
         tl_fail(error, TL_ERROR_MEMORY, "%s: not enough memory for the errors of its %lld x %lld samples", info->name,

@@ -219,8 +219,8 @@ static tl_status go_over_batch(sweep *self, size_t first, size_t end, tl_error *
     self->fine.count = 0;
     for (size_t k = first; k < end && status == TL_OK; k++)
         if (squares[k].log >= 0)
-            status = divide(self, squares[k], squares[k].block == LOD_NONE ? TL_SQUARE_LOG : LOD_RIDGE_LOG,
-                            &self->fine, error);
+            status = divide(self, squares[k], squares[k].block == LOD_NONE ? TL_SQUARE_LOG : LOD_RIDGE_LOG, &self->fine,
+                            error);
     sort(&self->fine);
     for (size_t k = 0; k < self->fine.count && status == TL_OK; k++) {
         const square *s = (const square *)self->fine.items + k;

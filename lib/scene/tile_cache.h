@@ -3,8 +3,8 @@
  *
  * Vertices are named by column and row on the lattice of level `levels`, the finest that is used: (x, y) is sample
  * (x, y) / 2^levels of the model. A vertex of a level above 0 lies in a tile of that level; those of levels 0 to -2 lie
- * in tiles of level 0, those of the next six in tiles of level -3, and so on: these come from the pyramid's overview, so
- * that coarse triangles, which reach over the rim of what is seen, have nothing read. */
+ * in tiles of level 0, those of the next six in tiles of level -3, and so on: these come from the pyramid's overview,
+ * so that coarse triangles, which reach over the rim of what is seen, have nothing read. */
 #ifndef SCENE_TILE_CACHE_H
 #define SCENE_TILE_CACHE_H
 
