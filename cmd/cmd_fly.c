@@ -20,7 +20,7 @@ typedef struct settings {
     int frame;
     int64_t frames; /* 0: by the path's times, or DEFAULT_FRAMES */
     double rate;
-    bool json, csv, frames_given;
+    bool json, csv, frames_given, measure;
 } settings;
 
 enum { DEFAULT_FRAMES = 250 };
@@ -92,8 +92,10 @@ typedef struct journey {
     const lod_ground *ground;
     const flight *path;
     const tl_run *run;
-    tl_roam *roam; /* NULL: frames start from nothing */
-    json_t *list;  /* statistics; NULL: not wanted */
+    tl_roam *roam;   /* NULL: frames start from nothing */
+    json_t *list;    /* statistics; NULL: not wanted */
+    tl_mesh *before; /* of the frame before, where shifts are measured; else NULL */
+    double largest;  /* shift in all frames, pixels */
 } journey;
 
 static bool draws_pictures(const settings *set)
@@ -159,40 +161,67 @@ static tl_status write_frame(const journey *j, const tl_mesh *mesh, size_t frame
     return error->status;
 }
 
-static tl_status fly_frame(const journey *j, const tl_view *view, size_t frame, tl_lod_stats *stats, tl_error *error)
+/* How far this frame's triangles, in place of those of the frame before, shift the ground that both have. */
+static tl_status measure_shift(journey *j, tl_mesh **mesh, const tl_view *view, tl_view_errors *out, tl_error *error)
 {
+    tl_view_report report = {0};
+    tl_run quiet = *j->run;
+    quiet.progress = NULL;
+    tl_status status = TL_OK;
+    if (j->before)
+        status = tl_view_measure(j->before, *mesh, j->ground->opened.source, view, &quiet, &report, error);
+    tl_mesh_destroy(j->before);
+    j->before = *mesh;
+    *mesh = NULL;
+    *out = report.parallax;
+    j->largest = fmax(j->largest, out->largest);
+    return status;
+}
+
+static tl_status fly_frame(journey *j, const tl_view *view, size_t frame, tl_lod_stats *stats, tl_view_errors *shift,
+                           tl_error *error)
+{
+    const bool draws = j->set->common.output || j->set->measure;
     const lod_ground *g = j->ground;
     const tl_view wide = view_for_mesh(j->set, view);
     tl_mesh *mesh = NULL;
     tl_status status;
     if (j->roam) {
         status = tl_roam_look(j->roam, &wide, stats, error);
-        if (status == TL_OK && j->set->common.output)
+        if (status == TL_OK && draws)
             status = tl_roam_mesh(j->roam, &mesh, error);
     } else
         status = tl_select(g->field, g->opened.source, g->pyramid, &wide, &j->set->lod.lod, &mesh, stats, error);
     if (status == TL_OK && j->set->common.output)
         status = write_frame(j, mesh, frame, error);
+    if (status == TL_OK && j->set->measure)
+        status = measure_shift(j, &mesh, view, shift, error);
     tl_mesh_destroy(mesh);
     return status;
 }
 
-static void tell_frame(const journey *j, size_t frame, const tl_lod_stats *s)
+static void tell_frame(const journey *j, size_t frame, const tl_lod_stats *s, const tl_view_errors *shift)
 {
     if (j->list) {
         json_t *item = lod_stats_json(s);
         json_object_set_new(item, "frame", json_integer((json_int_t)frame));
+        if (j->set->measure)
+            json_object_set_new(item, "shift", view_errors_json(shift));
         json_array_append_new(j->list, item);
     }
     if (!j->set->csv)
         return;
     if (!frame)
         printf("frame,triangles,vertices,visited,split,merged,tiles_made,samples_made,dem_blocks,finest_level,"
-               "pixel_error,seconds\n");
-    printf("%zu,%llu,%llu,%llu,%llu,%llu,%llu,%llu,%llu,%d,%.6g,%.6f\n", frame, (unsigned long long)s->triangles,
+               "pixel_error,seconds%s\n",
+               j->set->measure ? ",shift" : "");
+    printf("%zu,%llu,%llu,%llu,%llu,%llu,%llu,%llu,%llu,%d,%.6g,%.6f", frame, (unsigned long long)s->triangles,
            (unsigned long long)s->vertices, (unsigned long long)s->visited, (unsigned long long)s->split,
            (unsigned long long)s->merged, (unsigned long long)s->tiles_made, (unsigned long long)s->samples_made,
            (unsigned long long)s->dem_blocks, s->finest_level, s->pixel_error, s->seconds);
+    if (j->set->measure)
+        printf(",%.6g", shift->largest);
+    putchar('\n');
 }
 
 static void report(const settings *set, size_t frames, double first, double others, uint64_t triangles)
@@ -202,16 +231,17 @@ static void report(const settings *set, size_t frames, double first, double othe
                 frames, (double)triangles / (double)frames, first, steady);
 }
 
-static int fly_all(const journey *j, const flight *path, progress *bar)
+static int fly_all(journey *j, const flight *path, progress *bar)
 {
     tl_error error;
     double first = 0, others = 0;
     uint64_t triangles = 0;
     for (size_t k = 0; k < path->count; k++) {
         tl_lod_stats stats;
-        if (fly_frame(j, &path->views[k], k, &stats, &error) != TL_OK)
+        tl_view_errors shift = {0};
+        if (fly_frame(j, &path->views[k], k, &stats, &shift, &error) != TL_OK)
             return command_failed(bar, &error);
-        tell_frame(j, k, &stats);
+        tell_frame(j, k, &stats, &shift);
         *(k ? &others : &first) += stats.seconds;
         triangles += stats.triangles;
         if (j->run->progress)
@@ -219,6 +249,9 @@ static int fly_all(const journey *j, const flight *path, progress *bar)
     }
     progress_end(bar);
     report(j->set, path->count, first, others, triangles);
+    if (j->set->measure)
+        command_say(&j->set->common,
+                    "measured: from frame to frame new triangles shift no ground by more than %.3g pixels", j->largest);
     return EXIT_DONE;
 }
 
@@ -235,6 +268,7 @@ static int start(const settings *set, const lod_ground *ground, const flight *pa
     progress_stage(bar, "flying");
     int status = fly_all(&j, path, bar);
     tl_roam_destroy(j.roam);
+    tl_mesh_destroy(j.before);
     if (status == EXIT_DONE && j.list) {
         json_t *root = json_pack("{s:O}", "frames", j.list);
         if (json_dumpf(root, stdout, JSON_INDENT(2)) == 0)
@@ -311,6 +345,8 @@ static int run(const command *self, int argc, const char **argv, bool help)
         {"frame", 0, OPTION_CHOICE, &set.frame, NULL, "FRAME",
          "coordinates of the meshes (default: enu where the CRS is known)", 0, 0, frame_names},
         {"json", 0, OPTION_FLAG, &set.json, NULL, NULL, "print each frame's statistics as JSON", 0, 0, NULL},
+        {"measure", 0, OPTION_FLAG, &set.measure, NULL, NULL,
+         "tell how far, in pixels, new triangles shift ground from frame to frame", 0, 0, NULL},
         {"csv", 0, OPTION_FLAG, &set.csv, NULL, NULL, "print them as a table", 0, 0, NULL},
         {0}};
     const option running[] = {COMMON_RUNNING(set.common), {0}};

@@ -46,6 +46,10 @@ bool lod_options_ok(lod_options *o)
         complain("--distance-bands goes without --pixel-error and --budget");
         return false;
     }
+    if (o->bands && o->lod.morph) {
+        complain("--geomorph goes by pixel errors, not with --distance-bands");
+        return false;
+    }
     if (o->lod.max_level_given && o->max_level > o->levels) {
         complain("--max-level %d is beyond --levels %d; allow more levels", (int)o->max_level, (int)o->levels);
         return false;

@@ -111,6 +111,16 @@ extern const char *const selector_names[]; /* by tl_selector, ended by NULL */
          -30,                                                                                                           \
          30,                                                                                                            \
          NULL},                                                                                                         \
+        {"geomorph",                                                                                                    \
+         0,                                                                                                             \
+         OPTION_FLAG,                                                                                                   \
+         &(v).lod.morph,                                                                                                \
+         NULL,                                                                                                          \
+         NULL,                                                                                                          \
+         "move vertices to their places as the eye comes nearer, so that none comes with a jump",                       \
+         0,                                                                                                             \
+         0,                                                                                                             \
+         NULL},                                                                                                         \
         {"no-cull-frustum", 0, OPTION_FLAG, &(v).keep[0], NULL, NULL, "keep what is beside the screen", 0, 0, NULL},    \
         {"no-cull-back", 0, OPTION_FLAG, &(v).keep[1], NULL, NULL, "keep ground that looks away", 0, 0, NULL},          \
         {"no-cull-horizon",                                                                                             \

@@ -47,7 +47,7 @@ void view_report_text(const tl_view_report *r, char *text, size_t size)
              silhouette);
 }
 
-static json_t *errors_json(const tl_view_errors *e)
+json_t *view_errors_json(const tl_view_errors *e)
 {
     return json_pack("{s:I, s:f, s:f, s:f, s:f, s:f}", "count", (json_int_t)e->count, "p50", e->half, "p90", e->ninety,
                      "p99", e->ninety_nine, "p999", e->thousand, "max", e->largest);
@@ -55,6 +55,6 @@ static json_t *errors_json(const tl_view_errors *e)
 
 json_t *view_report_json(const tl_view_report *r)
 {
-    return json_pack("{s:o, s:o, s:I}", "parallax", errors_json(&r->parallax), "silhouette",
-                     errors_json(&r->silhouette), "missing", (json_int_t)r->missing);
+    return json_pack("{s:o, s:o, s:I}", "parallax", view_errors_json(&r->parallax), "silhouette",
+                     view_errors_json(&r->silhouette), "missing", (json_int_t)r->missing);
 }

@@ -74,6 +74,7 @@ bool picture_options_ok(picture_options *options);
 /* What tl_view_measure found, for people (two lines) and as JSON. */
 enum { VIEW_REPORT_TEXT = 560 };
 void view_report_text(const tl_view_report *report, char *text, size_t size);
+json_t *view_errors_json(const tl_view_errors *errors);
 json_t *view_report_json(const tl_view_report *report);
 
 #endif

@@ -764,6 +764,9 @@ typedef struct tl_lod_options {
     int max_level; /* finest level that may be used; 0: the field's own. Negative ones are coarser than the DEM */
     bool max_level_given;
     unsigned keep;     /* an or of tl_culling: rules that are switched off */
+    /* Vertices come and go where the surface is, and move to their places as the eye comes nearer: no vertex
+     * jumps. Takes the triangles of two thirds of the pixel error; not with bands. */
+    bool morph;
     const tl_run *run; /* its memory bounds what the choice keeps, beside the mesh */
 } tl_lod_options;
 

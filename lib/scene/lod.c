@@ -55,6 +55,9 @@ static tl_status check_options(const tl_lod_options *o, const char *name, tl_err
         if (!(o->bands[k] > (k ? o->bands[k - 1] : 0)) || isinf(o->bands[k]))
             return tl_fail(error, TL_ERROR_ARGUMENT, "%s: distance bands must be above 0 and rise, unlike %g", name,
                            o->bands[k]);
+    if (o->band_count && o->morph)
+        return tl_fail(error, TL_ERROR_ARGUMENT, "%s: vertices move by pixel errors, not by distance bands; give one",
+                       name);
     if (o->band_count && (o->budget || o->pixel_error > 0))
         return tl_fail(error, TL_ERROR_ARGUMENT,
                        "%s: distance bands take the place of a pixel error and a budget; give one of them", name);
@@ -105,6 +108,8 @@ tl_status lod_init(lod *l, const tl_source *field, const tl_source *dem, const t
     l->rules = TL_CULL_FRUSTUM | TL_CULL_BACK | TL_CULL_HORIZON | TL_CULL_RIDGE;
     bool alone = !(options->budget || options->band_count);
     l->pixel_error = options->pixel_error > 0 ? options->pixel_error : alone ? 1 : 0;
+    if (options->morph)
+        l->pixel_error *= LOD_MORPH;
     l->empty = !find_range(l);
     l->tiles = scene_tiles_create(field, dem, pyramid, l->levels, options->run, error);
     return l->tiles ? TL_OK : TL_ERROR_MEMORY;
@@ -251,7 +256,7 @@ tl_status lod_describe(const lod *l, const tl_view *view, tl_mesh *mesh, tl_erro
     for (int k = 0; k < 3; k++)
         tl_number_text(view->eye[k], number[k]);
     snprintf(eye, sizeof eye, "%s,%s,%s", number[0], number[1], number[2]);
-    tl_number_text(l->pixel_error, error_text);
+    tl_number_text(l->options->morph ? l->pixel_error / LOD_MORPH : l->pixel_error, error_text);
     tl_status status = tl_mesh_add_parameter(mesh, "lod", names[l->options->selector], error);
     if (status == TL_OK)
         status = tl_mesh_add_parameter(mesh, "eye", eye, error);
@@ -291,9 +296,15 @@ static tl_status select_triangles(lod *l, const tl_view *view, tl_mesh **out, tl
 {
     lod_list leaves = {0};
     tl_mesh *mesh = NULL;
+    float *heights = NULL;
+    double moved = 0;
     tl_status status = l->options->budget ? select_by_budget(l, &leaves, error) : run_selector(l, 0, &leaves, error);
+    if (status == TL_OK && l->options->morph)
+        status = lod_morph(l, &heights, &moved, error);
+    l->stats.pixel_error += moved;
     if (status == TL_OK)
-        status = lod_draw(l, leaves.items, leaves.count, &mesh, error);
+        status = lod_draw(l, leaves.items, leaves.count, heights, &mesh, error);
+    free(heights);
     if (status == TL_OK)
         status = lod_describe(l, view, mesh, error);
     free(leaves.items);

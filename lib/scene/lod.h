@@ -200,10 +200,19 @@ typedef struct lod_leaf {
     int32_t depth;
 } lod_leaf;
 
-/* The mesh of leaves, which lie side by side. */
-tl_status lod_draw(lod *l, const lod_leaf *leaves, size_t count, tl_mesh **out, tl_error *error);
+/* The mesh of leaves, which lie side by side. `heights`: of all vertices, in place of their own; may be NULL. */
+tl_status lod_draw(lod *l, const lod_leaf *leaves, size_t count, const float *heights, tl_mesh **out, tl_error *error);
 /* Only the number of its triangles. */
 tl_status lod_count(lod *l, const lod_leaf *leaves, size_t count, uint64_t *triangles, tl_error *error);
+
+/* ---- lod_morph.c ---- */
+
+/* What of the pixel error a mesh is chosen at whose vertices move. */
+#define LOD_MORPH (2. / 3)
+
+/* Heights of all vertices, freed by free(), that lie between those of the mesh and of one of twice its pixel error; and
+ * the most pixels by which one of them is beside its own. All vertices must be placed. */
+tl_status lod_morph(lod *l, float **out, double *pixels, tl_error *error);
 
 /* ---- Budgets ---- */
 

@@ -13,8 +13,9 @@ typedef struct drawing {
     const lod *l;
     const lod_leaf *leaves;
     size_t count;
-    uint64_t *counts;  /* of the triangles of each item; then of those before */
-    uint32_t *indices; /* NULL: only counted */
+    const float *heights; /* NULL: the vertices' own */
+    uint64_t *counts;     /* of the triangles of each item; then of those before */
+    uint32_t *indices;    /* NULL: only counted */
 } drawing;
 
 /* Where one item's triangles go. */
@@ -184,8 +185,8 @@ static size_t number_vertices(const lod *l, uint32_t *indices, uint64_t triangle
     return used;
 }
 
-static tl_mesh *assemble(const lod *l, const uint32_t *numbers, size_t used, uint32_t **indices, uint64_t triangles,
-                         tl_error *error)
+static tl_mesh *assemble(const lod *l, const float *heights, const uint32_t *numbers, size_t used, uint32_t **indices,
+                         uint64_t triangles, tl_error *error)
 {
     tl_mesh *mesh = tl_mesh_create(used, 0, &l->field->info, error);
     if (!mesh)
@@ -198,7 +199,8 @@ static tl_mesh *assemble(const lod *l, const uint32_t *numbers, size_t used, uin
     for (size_t k = 0; k < l->vertices.count; k++) {
         const lod_vertex *v = lod_at(l, (uint32_t)k);
         if (numbers[k] != LOD_NONE)
-            mesh->vertices[numbers[k]] = (tl_vertex){v->x * (INT32_C(1) << finer), v->y * (INT32_C(1) << finer), v->z};
+            mesh->vertices[numbers[k]] =
+                (tl_vertex){v->x * (INT32_C(1) << finer), v->y * (INT32_C(1) << finer), heights ? heights[k] : v->z};
     }
     return mesh;
 }
@@ -224,7 +226,7 @@ static tl_status draw_all(drawing *self, const tl_run *run, tl_mesh **out, tl_er
                                 : too_many(l, triangles, error);
     if (status == TL_OK) {
         size_t used = number_vertices(l, indices, triangles, numbers);
-        *out = assemble(l, numbers, used, &indices, triangles, error);
+        *out = assemble(l, self->heights, numbers, used, &indices, triangles, error);
         status = *out ? TL_OK : TL_ERROR_MEMORY;
     }
     free(indices);
@@ -232,10 +234,10 @@ static tl_status draw_all(drawing *self, const tl_run *run, tl_mesh **out, tl_er
     return status;
 }
 
-static tl_status draw_or_count(const lod *l, const lod_leaf *leaves, size_t count, tl_mesh **out, uint64_t *triangles,
-                               tl_error *error)
+static tl_status draw_or_count(const lod *l, const lod_leaf *leaves, size_t count, const float *heights, tl_mesh **out,
+                               uint64_t *triangles, tl_error *error)
 {
-    drawing self = {.l = l, .leaves = leaves, .count = count};
+    drawing self = {.l = l, .leaves = leaves, .count = count, .heights = heights};
     tl_run quiet = l->run ? *l->run : (tl_run){0};
     quiet.progress = NULL;
     self.counts = tl_alloc((size_t)items_of(&self), sizeof *self.counts);
@@ -246,12 +248,12 @@ static tl_status draw_or_count(const lod *l, const lod_leaf *leaves, size_t coun
     return status;
 }
 
-tl_status lod_draw(lod *l, const lod_leaf *leaves, size_t count, tl_mesh **out, tl_error *error)
+tl_status lod_draw(lod *l, const lod_leaf *leaves, size_t count, const float *heights, tl_mesh **out, tl_error *error)
 {
-    return draw_or_count(l, leaves, count, out, NULL, error);
+    return draw_or_count(l, leaves, count, heights, out, NULL, error);
 }
 
 tl_status lod_count(lod *l, const lod_leaf *leaves, size_t count, uint64_t *triangles, tl_error *error)
 {
-    return draw_or_count(l, leaves, count, NULL, triangles, error);
+    return draw_or_count(l, leaves, count, NULL, NULL, triangles, error);
 }

@@ -728,7 +728,8 @@ static tl_status update(tl_roam *r, tl_error *error)
     if (r->options.budget) { /* from the same place in every view: where more is hidden of a finer surface, it may have
                                 fewer triangles, and then the search's end depends on its way */
         int at = LOD_BUDGET_START;
-        return lod_search_budget(&r->l, r->options.pixel_error, LOD_BUDGET_STEP, &at, try_error, r, error);
+        double least = r->options.morph ? LOD_MORPH * r->options.pixel_error : r->options.pixel_error;
+        return lod_search_budget(&r->l, least, LOD_BUDGET_STEP, &at, try_error, r, error);
     }
     status = merge_all(r, &r->stale, error);
     return status == TL_OK ? split_all(r, &r->stale, error) : status;
@@ -812,6 +813,36 @@ tl_status tl_roam_look(tl_roam *r, const tl_view *view, tl_lod_stats *stats, tl_
     return status;
 }
 
+/* Sees from the last view again, for where its vertices are. */
+static tl_status morph(tl_roam *r, float **heights, tl_error *error)
+{
+    lod *l = &r->l;
+    double moved;
+    scene_view *from = scene_view_create(&r->view, l->dem, error);
+    if (!from)
+        return TL_ERROR_ARGUMENT;
+    scene_view_know_ground(from, (double)l->low, false);
+    l->view = from;
+    l->camera = scene_view_camera(from);
+    tl_status status = lod_place(l, 0, error);
+    if (status == TL_OK)
+        status = lod_morph(l, heights, &moved, error);
+    scene_view_destroy(from);
+    l->view = NULL;
+    l->camera = NULL;
+    return status;
+}
+
+static tl_status draw_mesh(tl_roam *r, tl_mesh **out, tl_error *error)
+{
+    float *heights = NULL;
+    tl_status status = r->options.morph && !r->l.empty ? morph(r, &heights, error) : TL_OK;
+    if (status == TL_OK)
+        status = lod_draw(&r->l, r->leaves.items, r->leaves.count, heights, out, error);
+    free(heights);
+    return status;
+}
+
 tl_status tl_roam_mesh(tl_roam *r, tl_mesh **out, tl_error *error)
 {
     tl_mesh *mesh = NULL;
@@ -824,7 +855,7 @@ tl_status tl_roam_mesh(tl_roam *r, tl_mesh **out, tl_error *error)
     if (!l->empty)
         status = gather_all(r, error);
     if (status == TL_OK)
-        status = lod_draw(l, r->leaves.items, r->leaves.count, &mesh, error);
+        status = draw_mesh(r, &mesh, error);
     if (status == TL_OK)
         status = lod_describe(l, &r->view, mesh, error);
     if (status == TL_OK)

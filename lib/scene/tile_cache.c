@@ -329,6 +329,15 @@ tl_status scene_tiles_want_block(scene_tiles *t, int64_t i, int64_t j, uint32_t 
     return TL_OK;
 }
 
+bool scene_tiles_find_block(const scene_tiles *t, int64_t i, int64_t j, uint32_t *block)
+{
+    const numbered *found = table_find(&t->block_table, key_of(0, i >> SCENE_TILE_LOG, j >> SCENE_TILE_LOG));
+    if (!found || !t->blocks[found->number]->made)
+        return false;
+    *block = found->number;
+    return true;
+}
+
 /* ---- Making tiles ---- */
 
 static tl_window within(tl_window w, int64_t width, int64_t height)

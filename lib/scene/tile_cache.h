@@ -73,6 +73,8 @@ void scene_slot_unmark(scene_slot slot, float z);
 
 /* The block of cell (i, j), empty until scene_tiles_make; a number from 0. They stay. */
 tl_status scene_tiles_want_block(scene_tiles *tiles, int64_t i, int64_t j, uint32_t *block, tl_error *error);
+/* The same of a block that is made; false: there is none. */
+bool scene_tiles_find_block(const scene_tiles *tiles, int64_t i, int64_t j, uint32_t *block);
 /* What is known of the square of 2^log cells that cell (i, j) lies in, log 0 ... 6. */
 void scene_block_at(const scene_tiles *tiles, uint32_t block, int64_t i, int64_t j, int log, scene_cells *out);
 
