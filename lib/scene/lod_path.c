@@ -122,9 +122,9 @@ static void at(const path *p, double knot, double out[CHANNELS])
     size_t end = k + 1 < p->count ? k + 1 : k;
     double length = p->knots[end] - p->knots[k], t = length > 0 ? (knot - p->knots[k]) / length : 0;
     double t2 = t * t, t3 = t2 * t;
-    for (int c = 0; c < CHANNELS; c++)
-        out[c] = (2 * t3 - 3 * t2 + 1) * p->values[k][c] + (t3 - 2 * t2 + t) * length * p->slopes[k][c] +
-                 (3 * t2 - 2 * t3) * p->values[end][c] + (t3 - t2) * length * p->slopes[end][c];
+    for (int c = 0; c < CHANNELS; c++) /* what stays the same does so to the last bit: another lens is a new start */
+        out[c] = p->values[k][c] + (3 * t2 - 2 * t3) * (p->values[end][c] - p->values[k][c]) +
+                 (t3 - 2 * t2 + t) * length * p->slopes[k][c] + (t3 - t2) * length * p->slopes[end][c];
 }
 
 /* Knots at equal distances along the way: its length is summed up over PARTS steps a key. */
