@@ -200,13 +200,30 @@ static void edges(const fbm_edge_job *job, size_t count)
 
 /* A point is the mean of the orbit next to it and the weighted differences of the others from that: whatever the
  * weights, a plateau stays as it is. Weights 0 ... are those of the second orbit on; of squares, where orbits pair up,
- * of the pairs. Taps follow them. */
-enum { SQUARE_SIZE = 8, SIZE = 16, BLOCK = 1 << FBM_PLACES_SHIFT, CHUNK = 64, ROOM = CHUNK + BLOCK };
+ * of the pairs. Taps follow them. Those of edges come behind those of centres.
+ *
+ * Coefficients lie in planes, coefficient k of vertex v at [k * stride + v], so that loops run over vertices and points
+ * whatever the distance between them. What is made of a row is made in whole vectors, and rows of scratch have room for
+ * that; what is read of the caller's and written to him is not. */
+enum {
+    LANES = 8,
+    SQUARE_CENTRES = 6,
+    SQUARE_EDGES = 6,
+    CENTRES = 9,
+    EDGES = 11,
+    PLANES = CENTRES + EDGES,
+    BLOCK = 1 << FBM_PLACES_SHIFT
+};
 
-static void add_rows(const float *restrict a, const float *restrict b, float *restrict out, size_t count)
+static size_t least(size_t a, size_t b)
 {
-    for (size_t k = 0; k < count; k++)
-        out[k] = a[k] + b[k];
+    return a < b ? a : b;
+}
+
+/* Whether a plane is of taps. */
+ALWAYS_INLINE bool is_tap(bool square, int plane)
+{
+    return square ? plane % SQUARE_CENTRES >= 3 : (plane >= 5 && plane < CENTRES) || plane >= CENTRES + 7;
 }
 
 /* The loops over the coefficients of a vertex; `size` is a constant where they are called. */
@@ -217,82 +234,46 @@ ALWAYS_INLINE void mix_values(const float *restrict a, const float *restrict b, 
         out[k] = a[k] + part * (b[k] - a[k]);
 }
 
-ALWAYS_INLINE void scale_noise(const float *restrict in, const float *restrict taps, float factor, size_t size,
-                               float *restrict out)
-{
-    for (size_t k = 0; k < size; k++)
-        out[k] = in[k] * (taps[k] * factor + (1 - taps[k]));
-}
-
-ALWAYS_INLINE void subtract(const float *restrict a, const float *restrict b, size_t size, float *restrict out)
-{
-    for (size_t k = 0; k < size; k++)
-        out[k] = a[k] - b[k];
-}
-
 /* Between the knots about an exponent, of nodes weighted by `nodes`. */
-ALWAYS_INLINE void unit_vertices(const fbm_places_table *table, int node_count, const float *nodes, const float *hurst,
-                                 const float *roots, size_t size, size_t count, float *restrict out)
+ALWAYS_INLINE void unit_vertex(const fbm_places_table *table, int node_count, const float *nodes, float hurst,
+                               size_t size, float *restrict sum)
 {
     const size_t all = size * (size_t)node_count;
-    float sum[2 * SIZE], mixed[2 * SIZE];
-    for (size_t x = 0; x < count; x++) {
-        const float place = (hurst[x] - FBM_PLACES_LOW) * FBM_PLACES_KNOTS_PER_UNIT;
-        const int32_t floor = (int32_t)place, before = floor < FBM_PLACES_STEPS ? floor : FBM_PLACES_STEPS - 1;
-        const float *from = table->values + (size_t)before * all, part = place - (float)before;
-        mix_values(from, from + all, part, size, sum);
-        for (int n = 1; n < node_count; n++) {
-            mix_values(from + n * size, from + all + n * size, part, size, mixed);
-            for (size_t k = 0; k < size; k++)
-                sum[k] = (n > 1 ? sum[k] : nodes[0] * sum[k]) + nodes[n] * mixed[k];
-        }
-        scale_noise(sum, table->taps, roots[x], size, out + x * size);
+    const float place = (hurst - FBM_PLACES_LOW) * FBM_PLACES_KNOTS_PER_UNIT;
+    const int32_t floor = (int32_t)place, before = floor < FBM_PLACES_STEPS ? floor : FBM_PLACES_STEPS - 1;
+    const float *from = table->values + (size_t)before * all, part = place - (float)before;
+    float mixed[PLANES];
+    mix_values(from, from + all, part, size, sum);
+    for (int n = 1; n < node_count; n++) {
+        mix_values(from + (size_t)n * size, from + all + (size_t)n * size, part, size, mixed);
+        for (size_t k = 0; k < size; k++)
+            sum[k] = (n > 1 ? sum[k] : nodes[0] * sum[k]) + nodes[n] * mixed[k];
+    }
+}
+
+/* Vertices by eights, which are then turned into planes. */
+ALWAYS_INLINE void unit_vertices(const fbm_places_table *table, bool square, int node_count, const float *nodes,
+                                 const float *hurst, const float *roots, size_t size, size_t count, size_t stride,
+                                 float *restrict out)
+{
+    float sums[LANES][PLANES];
+    for (size_t x = 0; x < count; x += LANES) {
+        const size_t n = least(count - x, LANES);
+        for (size_t i = 0; i < n; i++)
+            unit_vertex(table, node_count, nodes, hurst[x + i], size, sums[i]);
+        for (size_t k = 0; k < size; k++)
+            for (size_t i = 0; i < n; i++)
+                out[k * stride + x + i] = is_tap(square, (int)k) ? sums[i][k] * roots[x + i] : sums[i][k];
     }
 }
 
 static void place_unit(const fbm_places_table *table, const float *nodes, const float *hurst, const float *roots,
-                       size_t count, float *out)
+                       size_t count, size_t stride, float *out)
 {
     if (table->square)
-        unit_vertices(table, 1, nodes, hurst, roots, 2 * SQUARE_SIZE, count, out);
+        unit_vertices(table, true, 1, nodes, hurst, roots, SQUARE_CENTRES + SQUARE_EDGES, count, stride, out);
     else
-        unit_vertices(table, table->nodes, nodes, hurst, roots, 2 * SIZE, count, out);
-}
-
-ALWAYS_INLINE void scale_vertices(const float *taps, const float *strengths, size_t size, size_t count,
-                                  const float *unit, float *out)
-{
-    for (size_t x = 0; x < count; x++) {
-        scale_noise(unit + 2 * x * size, taps, strengths[x], size, out + 4 * x * size);
-        scale_noise(unit + (2 * x + 1) * size, taps + size, strengths[x], size, out + (4 * x + 2) * size);
-    }
-    for (size_t half = 0; half + 1 < 2 * count; half++) { /* what the next vertex has more */
-        float *at = out + 2 * half * size;
-        if (half + 2 < 2 * count)
-            subtract(at + 4 * size, at, size, at + size);
-    }
-    for (size_t k = 0; k < size && count; k++) /* points on the last vertex take nothing of a next one */
-        out[(4 * count - 3) * size + k] = out[(4 * count - 1) * size + k] = 0;
-}
-
-static void place_scale(const fbm_places_table *table, const float *strengths, size_t count, const float *unit,
-                        float *out)
-{
-    if (table->square)
-        scale_vertices(table->taps, strengths, SQUARE_SIZE, count, unit, out);
-    else
-        scale_vertices(table->taps, strengths, SIZE, count, unit, out);
-}
-
-static void place_values(const float *a, const float *b, float part, bool square, size_t count, float *out)
-{
-    if (square)
-        for (size_t x = 0; x < count; x++)
-            mix_values(a + 4 * SQUARE_SIZE * x, b + 4 * SQUARE_SIZE * x, part, 2 * SQUARE_SIZE,
-                       out + 2 * SQUARE_SIZE * x);
-    else
-        for (size_t x = 0; x < count; x++)
-            mix_values(a + 4 * SIZE * x, b + 4 * SIZE * x, part, 2 * SIZE, out + 2 * SIZE * x);
+        unit_vertices(table, false, table->nodes, nodes, hurst, roots, PLANES, count, stride, out);
 }
 
 static void strengths(const float *restrict strength, const float *restrict hurst, float fall, float *restrict out,
@@ -313,203 +294,269 @@ static void strengths(const float *restrict strength, const float *restrict hurs
     }
 }
 
-/* The coefficients of a run of points: linear between two vertices, or, of blocks too short for a vector, one by one.
- */
-typedef struct place_run {
-    const float *values; /* of the first vertex; NULL: `rows` are */
-    const float *rows;   /* coefficient k of point x is at [k * ROOM + x] */
-    const float *part;   /* of the way to the next vertex, by point */
-} place_run;
+/* ---- Points by place --------------------------------------------------------------------------- */
 
-static const float parts[2][2 * BLOCK] = {{0, .125F, .25F, .375F, .5F, .625F, .75F, .875F},
-                                          {.0625F, .1875F, .3125F, .4375F, .5625F, .6875F, .8125F, .9375F}};
+/* Eight floats, and where they lie, which is aligned to one float. Whatever the instruction set has, compilers make of
+ * it. */
+typedef float eight __attribute__((vector_size(LANES * sizeof(float))));
+typedef float eight_floats __attribute__((vector_size(LANES * sizeof(float)), aligned(sizeof(float)), may_alias));
+#define AT(p) ((eight) * (const eight_floats *)(p))
+#define PUT(p) (*(eight_floats *)(p))
 
-/* Coefficient k of point x. */
-#define C(k) (ramp ? values[k] + part[x] * values[size + (k)] : rows[(k)*ROOM + x])
+/* Room of a plane, an odd multiple of a cache line, and the vertices of one that are made at a time. */
+enum { ROOM = 144, PIECE = 128, PARTS = 2 * LANES };
 
-ALWAYS_INLINE void centre_predictor(place_run run, bool ramp, bool square, const float *restrict near,
-                                    const float *restrict middle, const float *restrict far, size_t count,
-                                    float *restrict out)
+/* a + b, or a b, of `count` numbers, the last eight of them twice rather than one by one. */
+#define COMBINE(name, operation)                                                               \
+    static inline void name(const float *a, const float *b, float *restrict out, size_t count) \
+    {                                                                                          \
+        size_t x = 0;                                                                          \
+        for (; x + LANES <= count; x += LANES)                                                 \
+            PUT(out + x) = AT(a + x) operation AT(b + x);                                      \
+        if (x < count && count >= LANES) {                                                     \
+            x = count - LANES;                                                                 \
+            PUT(out + x) = AT(a + x) operation AT(b + x);                                      \
+        } else                                                                                 \
+            for (; x < count; x++)                                                             \
+                out[x] = a[x] operation b[x];                                                  \
+    }
+COMBINE(add_rows, +)
+COMBINE(multiply_rows, *)
+#undef COMBINE
+
+static void place_scale(bool square, const float *strengths, size_t count, const float *unit, size_t stride, float *out)
 {
-    const float *restrict values = run.values, *restrict rows = run.rows, *restrict part = run.part;
-    const size_t size = square ? SQUARE_SIZE : SIZE;
-    for (size_t x = 0; x < count; x++) {
-        const float n = near[x + 2] + near[x + 3];
-        const float a = near[x + 1] + near[x + 4], b = middle[x + 2] + middle[x + 3], c = middle[x + 1] + middle[x + 4];
-        const float d = near[x] + near[x + 5], e = far[x + 2] + far[x + 3];
-        if (square)
-            out[x] = .25F * n + ((C(0) * ((a + b) - 2 * n) + C(1) * (c - n)) + C(2) * ((d + e) - 2 * n));
+    for (int k = 0; k < (square ? SQUARE_CENTRES + SQUARE_EDGES : PLANES); k++, unit += stride, out += count)
+        if (is_tap(square, k))
+            multiply_rows(unit, strengths, out, count);
         else
-            out[x] =
-                .25F * n + (((C(0) * (a - n) + C(1) * (b - n)) + C(2) * (c - n)) + (C(3) * (d - n) + C(4) * (e - n)));
+            for (size_t x = 0; x < count; x++)
+                out[x] = unit[x];
+}
+
+/* Planes of a row's vertices from `vertex` on, part of the way between two rows of them. */
+static void blend_planes(const fbm_place_row *row, size_t vertex, size_t vertices, size_t planes, float *restrict out)
+{
+    const float part = row->part;
+    for (size_t k = 0; k < planes; k++, out += ROOM) {
+        const float *a = row->above + k * row->stride + vertex, *b = row->below + k * row->stride + vertex;
+        for (size_t x = 0; x < vertices; x += LANES)
+            PUT(out + x) = AT(a + x) + part * (AT(b + x) - AT(a + x));
     }
 }
 
-ALWAYS_INLINE void centre_noise(place_run run, bool ramp, bool square, const float *restrict at,
-                                const float *restrict beside, size_t count, float *restrict out)
+/* What a job's points are made of. */
+typedef struct place_rows {
+    const float *at, *sums[4], *g[3]; /* side[1]; the rows that were added up; noise */
+    float *out;
+} place_rows;
+
+static place_rows rows_from(const place_rows *rows, size_t x)
 {
-    const float *restrict values = run.values, *restrict rows = run.rows, *restrict part = run.part;
-    const size_t size = square ? SQUARE_SIZE : SIZE;
-    for (size_t x = 0; x < count; x++) {
-        const float own = at[x + 1], sides = at[x] + at[x + 2], ends = beside[x + 1],
-                    corners = beside[x] + beside[x + 2];
-        if (square)
-            out[x] += C(3) * own + (C(4) * (sides + ends) + C(5) * corners);
-        else
-            out[x] += (C(5) * own + C(6) * sides) + (C(7) * ends + C(8) * corners);
-    }
+    place_rows out = {.at = rows->at + x, .out = rows->out + x};
+    for (int k = 0; k < 4; k++)
+        out.sums[k] = rows->sums[k] + x;
+    for (int k = 0; k < 3; k++)
+        out.g[k] = rows->g[k] + x;
+    return out;
 }
 
-ALWAYS_INLINE void edge_predictor(place_run run, bool ramp, bool square, const float *restrict at,
-                                  const float *restrict beside, const float *restrict near, const float *restrict far,
-                                  size_t count, float *restrict out)
-{
-    const float *restrict values = run.values, *restrict rows = run.rows, *restrict part = run.part;
-    const size_t size = square ? SQUARE_SIZE : SIZE;
-    for (size_t x = 0; x < count; x++) {
-        const float n = at[x + 1] + at[x + 2], a = near[x + 1];
-        const float b = beside[x + 1] + beside[x + 2], c = near[x] + near[x + 2], d = far[x + 1], e = at[x] + at[x + 3],
-                    f = far[x] + far[x + 2], g = beside[x] + beside[x + 3];
-        if (square) {
-            const float m = n + a;
-            out[x] = .25F * m + ((C(0) * ((b + c) - 2 * m) + C(1) * ((d + e) - m)) + C(2) * ((f + g) - 2 * m));
-        } else
-            out[x] = .5F * n + (((C(0) * (a - n) + C(1) * (b - 2 * n)) + (C(2) * (c - 2 * n) + C(3) * (d - n))) +
-                                ((C(4) * (e - n) + C(5) * (f - 2 * n)) + C(6) * (g - 2 * n)));
-    }
-}
+#if defined(__clang__) || __GNUC__ >= 12
+#define SHUFFLE(v, ...) __builtin_shufflevector(v, v, __VA_ARGS__)
+#else
+typedef int32_t eight_places __attribute__((vector_size(LANES * sizeof(int32_t))));
+#define SHUFFLE(v, ...) __builtin_shuffle(v, (eight_places){__VA_ARGS__})
+#endif
+#define ALL(p) ((p)[0] - (eight){0})
+/* What eight points that begin with a block take of the vertices before and behind each; where they have two of
+ * them, `last` is the first one's, taken over from the eight before. */
+#define MIX(before, behind) (AT(parts) * (before) + AT(parts + PARTS) * (behind))
+#define OF0(p) MIX(AT(p), AT((p) + 1))
+#define OF1(p) MIX(SHUFFLE(AT(p), 0, 0, 1, 1, 2, 2, 3, 3), SHUFFLE(AT(p), 1, 1, 2, 2, 3, 3, 4, 4))
+#define OF2(p) MIX(SHUFFLE(AT(p), 0, 0, 0, 0, 1, 1, 1, 1), SHUFFLE(AT(p), 1, 1, 1, 1, 2, 2, 2, 2))
+#define OF3(p, last) MIX(last, ALL((p) + 1))
+#define OF(p, last) (shift == 0 ? OF0(p) : shift == 1 ? OF1(p) : shift == 2 ? OF2(p) : OF3(p, last))
+#define C(k) OF(c + (k)*ROOM, last[k])
+/* before anything is written, so that nothing is loaded twice */
+#define KEEP_LAST                                    \
+    for (size_t k = 0; k < EDGES && shift == 3; k++) \
+        last[k] = ALL(c + k * ROOM + 1);
 
-ALWAYS_INLINE void edge_noise(place_run run, bool ramp, bool square, const float *restrict above,
-                              const float *restrict at, const float *restrict below, const float *restrict other,
-                              size_t count, float *restrict out)
+ALWAYS_INLINE void centre_eight(const place_rows *rows, size_t x, const float *c, const float *parts, eight *last,
+                                bool noisy, int shift, bool square)
 {
-    const float *restrict values = run.values, *restrict rows = run.rows, *restrict part = run.part;
-    const size_t size = square ? SQUARE_SIZE : SIZE;
-    for (size_t x = 0; x < count; x++) {
-        const float own = at[x + 1], corners = other[x + 1] + other[x + 2], sides = at[x] + at[x + 2],
-                    ends = above[x + 1] + below[x + 1];
-        if (square)
-            out[x] += C(3) * own + (C(4) * corners + C(5) * (sides + ends));
-        else
-            out[x] += (C(7) * own + C(8) * corners) + (C(9) * sides + C(10) * ends);
-    }
-}
-
-ALWAYS_INLINE void centre_run(const fbm_centre_job *job, place_run run, bool ramp, bool square, size_t x, size_t count)
-{
-    float *const *p = job->partial;
-    centre_predictor(run, ramp, square, p[0] + x, p[1] + x, p[2] + x, count, job->out + x);
-    if (job->g[0])
-        centre_noise(run, ramp, square, job->g[1] + x, p[3] + x, count, job->out + x);
-}
-
-ALWAYS_INLINE void edge_run(const fbm_edge_job *job, place_run run, bool ramp, bool square, size_t x, size_t count)
-{
-    float *const *p = job->partial;
-    edge_predictor(run, ramp, square, job->side[1] + x, p[0] + x, p[1] + x, p[2] + x, count, job->out + x);
-    if (job->g[0])
-        edge_noise(run, ramp, square, job->g[0] + x, job->g[1] + x, job->g[2] + x, p[3] + x, count, job->out + x);
-}
-
-/* Either, at points x ... x + count - 1 of a job. */
-ALWAYS_INLINE void any_run(const void *job, bool edges, place_run run, bool ramp, bool square, size_t x, size_t count)
-{
-    if (edges)
-        edge_run(job, run, ramp, square, x, count);
+    const float *near = rows->sums[0] + x, *middle = rows->sums[1] + x, *far = rows->sums[2] + x,
+                *beside = rows->sums[3] + x, *own = rows->g[1] + x;
+    const eight n = AT(near + 2) + AT(near + 3), a = AT(near + 1) + AT(near + 4), b = AT(middle + 2) + AT(middle + 3),
+                c2 = AT(middle + 1) + AT(middle + 4), d = AT(near) + AT(near + 5), e = AT(far + 2) + AT(far + 3);
+    eight sum;
+    if (square)
+        sum = .25F * n + ((C(0) * ((a + b) - 2.F * n) + C(1) * (c2 - n)) + C(2) * ((d + e) - 2.F * n));
     else
-        centre_run(job, run, ramp, square, x, count);
-}
-
-/* Points whose blocks are whole vectors. */
-ALWAYS_INLINE void walk_blocks(const void *job, bool edges, const fbm_place_row *row, bool square, size_t count)
-{
-    const size_t stride = square ? 2 * SQUARE_SIZE : 2 * SIZE;
-    const float *values = row->values + (row->first >> FBM_PLACES_SHIFT) * stride;
-    size_t offset = row->first & (BLOCK - 1);
-    for (size_t x = 0; x < count; values += stride, offset = 0) {
-        const place_run run = {values, NULL, parts[row->half] + offset};
-        size_t n = BLOCK - offset < count - x ? BLOCK - offset : count - x;
-        if (count - x >= BLOCK) /* the next block makes its own points again */
-            any_run(job, edges, run, true, square, x, BLOCK);
+        sum = .25F * n + (((C(0) * (a - n) + C(1) * (b - n)) + C(2) * (c2 - n)) + (C(3) * (d - n) + C(4) * (e - n)));
+    if (noisy) {
+        const eight sides = AT(own) + AT(own + 2), corners = AT(beside) + AT(beside + 2);
+        if (square)
+            sum += C(3) * AT(own + 1) + (C(4) * (sides + AT(beside + 1)) + C(5) * corners);
         else
-            any_run(job, edges, run, true, square, x, n);
-        x += n;
+            sum += (C(5) * AT(own + 1) + C(6) * sides) + (C(7) * AT(beside + 1) + C(8) * corners);
+    }
+    KEEP_LAST
+    PUT(rows->out + x) = sum;
+}
+
+ALWAYS_INLINE void edge_eight(const place_rows *rows, size_t x, const float *c, const float *parts, eight *last,
+                              bool noisy, int shift, bool square)
+{
+    const float *at = rows->at + x, *beside = rows->sums[0] + x, *near = rows->sums[1] + x, *far = rows->sums[2] + x,
+                *other = rows->sums[3] + x;
+    const eight n = AT(at + 1) + AT(at + 2), a = AT(near + 1), b = AT(beside + 1) + AT(beside + 2),
+                c2 = AT(near) + AT(near + 2), d = AT(far + 1), e = AT(at) + AT(at + 3), f = AT(far) + AT(far + 2),
+                g = AT(beside) + AT(beside + 3);
+    eight sum;
+    if (square) {
+        const eight m = n + a;
+        sum = .25F * m + ((C(0) * ((b + c2) - 2.F * m) + C(1) * ((d + e) - m)) + C(2) * ((f + g) - 2.F * m));
+    } else
+        sum = .5F * n + (((C(0) * (a - n) + C(1) * (b - 2.F * n)) + (C(2) * (c2 - 2.F * n) + C(3) * (d - n))) +
+                         ((C(4) * (e - n) + C(5) * (f - 2.F * n)) + C(6) * (g - 2.F * n)));
+    if (noisy) {
+        const float *above = rows->g[0] + x, *own = rows->g[1] + x, *below = rows->g[2] + x;
+        const eight corners = AT(other + 1) + AT(other + 2), sides = AT(own) + AT(own + 2),
+                    ends = AT(above + 1) + AT(below + 1);
+        if (square)
+            sum += C(3) * AT(own + 1) + (C(4) * corners + C(5) * (sides + ends));
+        else
+            sum += (C(7) * AT(own + 1) + C(8) * corners) + (C(9) * sides + C(10) * ends);
+    }
+    KEEP_LAST
+    PUT(rows->out + x) = sum;
+}
+
+ALWAYS_INLINE void make_eights(const place_rows *rows, size_t count, const float *c, const float *parts, bool edges,
+                               bool noisy, int shift, bool square)
+{
+    const place_rows here = *rows; /* which nothing that is written can change */
+    eight last[EDGES];
+    for (size_t k = 0; k < EDGES; k++)
+        last[k] = ALL(c + k * ROOM);
+    for (size_t x = 0; x < count; x += LANES, c += LANES >> shift)
+        if (edges)
+            edge_eight(&here, x, c, parts, last, noisy, shift, square);
+        else
+            centre_eight(&here, x, c, parts, last, noisy, shift, square);
+}
+
+#undef KEEP_LAST
+#undef C
+#undef OF
+#undef OF0
+#undef OF1
+#undef OF2
+#undef OF3
+#undef MIX
+#undef ALL
+#undef SHUFFLE
+
+/* Points of a job by eights that begin with a block, or, of one that has not eight points, by one that begins within;
+ * at `parts` are the shares of the vertices before, and PARTS behind those of the next ones. Not inlined, for
+ * coefficients are then at fixed distances from one pointer, which a processor adds as it loads. */
+typedef void eights(const place_rows *rows, size_t count, const float *coefficients, const float *parts);
+#define EIGHTS(name, edges, noisy, shift, square)                                                               \
+    static __attribute__((noinline)) void name(const place_rows *rows, size_t count, const float *coefficients, \
+                                               const float *parts)                                              \
+    {                                                                                                           \
+        make_eights(rows, count, coefficients, parts, edges, noisy, shift, square);                             \
+    }
+#define EACH(name, edges, noisy)                  \
+    EIGHTS(name##0, edges, noisy, 0, false)       \
+    EIGHTS(name##1, edges, noisy, 1, false)       \
+    EIGHTS(name##2, edges, noisy, 2, false)       \
+    EIGHTS(name##3, edges, noisy, 3, false)       \
+    EIGHTS(name##0_square, edges, noisy, 0, true) \
+    EIGHTS(name##1_square, edges, noisy, 1, true) \
+    EIGHTS(name##2_square, edges, noisy, 2, true) \
+    EIGHTS(name##3_square, edges, noisy, 3, true)
+#define NAMES(name)                                                        \
+    {                                                                      \
+        {name##0, name##1, name##2, name##3},                              \
+        {                                                                  \
+            name##0_square, name##1_square, name##2_square, name##3_square \
+        }                                                                  \
+    }
+EACH(smooth_centres, false, false)
+EACH(noisy_centres, false, true)
+EACH(smooth_edges, true, false)
+EACH(noisy_edges, true, true)
+/* by [edges][noisy][square][shift] */
+static eights *const all_eights[2][2][2][FBM_PLACES_SHIFT + 1] = {{NAMES(smooth_centres), NAMES(noisy_centres)},
+                                                                  {NAMES(smooth_edges), NAMES(noisy_edges)}};
+#undef EIGHTS
+#undef EACH
+#undef NAMES
+
+/* Shares of the vertices before and behind a row's points, which begin anew with every block. */
+static void make_parts(const fbm_place_row *row, float parts[2 * PARTS])
+{
+    const int32_t block = 1 << row->shift;
+    const float unit = 1 / (float)(2 * block);
+    for (int32_t x = 0; x < PARTS; x++) {
+        parts[PARTS + x] = (float)(2 * (x & (block - 1)) + row->half) * unit;
+        parts[x] = 1 - parts[PARTS + x];
     }
 }
 
-/* The coefficients of whole blocks, point by point. */
-ALWAYS_INLINE void expand_blocks(const float *restrict values, size_t block, const float *restrict part,
-                                 size_t coefficients, size_t size, size_t blocks, float *restrict out)
+/* What an eight makes beyond its block, the next makes again. */
+static void walk(const place_rows *rows, bool edges, bool noisy, const fbm_place_row *row, size_t count)
 {
-    for (size_t b = 0; b < blocks; b++)
-        for (size_t k = 0; k < coefficients; k++)
-            for (size_t x = 0; x < block; x++)
-                out[k * ROOM + b * block + x] = values[2 * size * b + k] + part[x] * values[2 * size * b + size + k];
-}
-
-/* Those of the points from column `at` on. Returns where the first of them is. */
-ALWAYS_INLINE size_t expand(const fbm_place_row *row, size_t at, size_t coefficients, size_t size, size_t count,
-                            float *restrict out)
-{
-    static const float fours[2][4] = {{0, .25F, .5F, .75F}, {.125F, .375F, .625F, .875F}};
-    static const float twos[2][2] = {{0, .5F}, {.25F, .75F}}, ones[2][1] = {{0}, {.5F}};
-    const size_t offset = at & (((size_t)1 << row->shift) - 1), first = at >> row->shift,
-                 blocks = ((at + count - 1) >> row->shift) + 1 - first;
-    const float *values = row->values + first * 2 * size;
-    if (row->shift == 2)
-        expand_blocks(values, 4, fours[row->half], coefficients, size, blocks, out);
-    else if (row->shift == 1)
-        expand_blocks(values, 2, twos[row->half], coefficients, size, blocks, out);
-    else
-        expand_blocks(values, 1, ones[row->half], coefficients, size, blocks, out);
-    return offset;
-}
-
-ALWAYS_INLINE void walk_chunks(const void *job, bool edges, const fbm_place_row *row, bool square, size_t count)
-{
-    const size_t size = square ? SQUARE_SIZE : SIZE, coefficients = square ? 6 : edges ? 11 : 9;
-    float rows[(SIZE - 5) * ROOM];
-    for (size_t x = 0; x < count; x += CHUNK) {
-        size_t n = count - x < CHUNK ? count - x : CHUNK;
-        size_t offset = expand(row, row->first + x, coefficients, size, n, rows);
-        any_run(job, edges, (place_run){NULL, rows + offset, NULL}, false, square, x, n);
+    eights *const make = all_eights[edges][noisy][row->square][row->shift];
+    const size_t coefficients = row->square ? SQUARE_CENTRES : edges ? EDGES : CENTRES;
+    const size_t block = (size_t)1 << row->shift;
+    _Alignas(64) float planes[EDGES * ROOM];
+    float parts[2 * PARTS];
+    make_parts(row, parts);
+    for (size_t x = 0, end; x < count; x = end) {
+        const size_t first = (row->first + x) >> row->shift, offset = (row->first + x) & (block - 1);
+        end = least(count, ((first + PIECE) << row->shift) - row->first);
+        blend_planes(row, first, ((row->first + end - 1) >> row->shift) + 2 - first, coefficients, planes);
+        place_rows here = rows_from(rows, x);
+        if (offset) {
+            make(&here, LANES, planes, parts + offset);
+            x += block - offset;
+            here = rows_from(rows, x);
+        }
+        if (x < end)
+            make(&here, end - x, planes + (offset > 0), parts);
     }
-}
-
-static inline void place_points(const void *job, bool edges, const fbm_place_row *row, size_t count)
-{
-    if (row->shift == FBM_PLACES_SHIFT && row->square)
-        walk_blocks(job, edges, row, true, count);
-    else if (row->shift == FBM_PLACES_SHIFT)
-        walk_blocks(job, edges, row, false, count);
-    else if (row->square)
-        walk_chunks(job, edges, row, true, count);
-    else
-        walk_chunks(job, edges, row, false, count);
 }
 
 static void place_centres(const fbm_centre_job *job, const fbm_place_row *row, size_t count)
 {
     float *const *p = job->partial;
+    const float *noise = job->g[0] ? job->g[1] : p[3];
     for (int k = 0; k < 3; k++)
         add_rows(job->z[2 - k], job->z[3 + k], p[k], count + 5);
     if (job->g[0])
         add_rows(job->g[0], job->g[2], p[3], count + 2);
-    place_points(job, false, row, count);
+    const place_rows rows = {p[3], {p[0], p[1], p[2], p[3]}, {noise, noise, noise}, job->out};
+    walk(&rows, false, job->g[0] != NULL, row, count);
 }
 
 static void place_edges(const fbm_edge_job *job, const fbm_place_row *row, size_t count)
 {
     float *const *p = job->partial;
+    const float *const *g = job->g[0] ? job->g : (const float *const *)p;
     add_rows(job->side[0], job->side[2], p[0], count + 3);
     add_rows(job->same[1], job->same[2], p[1], count + 2);
     add_rows(job->same[0], job->same[3], p[2], count + 2);
     if (job->g[0])
         add_rows(job->other[0], job->other[1], p[3], count + 3);
-    place_points(job, true, row, count);
+    const place_rows rows = {job->side[1], {p[0], p[1], p[2], p[3]}, {g[0], g[1], g[2]}, job->out};
+    walk(&rows, true, job->g[0] != NULL, row, count);
 }
 
-#undef C
+#undef AT
+#undef PUT
 #undef ALWAYS_INLINE
 
 /* ---- Means ------------------------------------------------------------------------------------- */
@@ -566,7 +613,6 @@ const fbm_kernel JOIN(fbm_kernel_, FBM_KERNEL) = {
     .place_edges = place_edges,
     .place_unit = place_unit,
     .place_scale = place_scale,
-    .place_values = place_values,
     .strengths = strengths,
     .mean2 = mean2,
     .mean4 = mean4,

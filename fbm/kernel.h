@@ -28,11 +28,12 @@ typedef struct fbm_edge_job {
     float *out;        /* count edges */
 } fbm_edge_job;
 
-/* Coefficients that change along a row (see fbm/places.h): those of vertex v are at [v * 2 * size], followed by what
- * they grow by up to the next vertex; size is fbm_places_size / 2. The point x of a job lies in the block of vertex
- * (first + x) >> shift, `half` a cell into its cell. */
+/* Coefficients that change along a row (see fbm/places.h): `part` of the way from the planes of the vertices above to
+ * those below. The point x of a job lies in the block of vertex (first + x) >> shift, `half` a cell into its cell. */
 typedef struct fbm_place_row {
-    const float *values;
+    const float *above, *below; /* coefficient k of vertex v at [k * stride + v]; FBM_PLACES_SPARE more are read */
+    size_t stride;
+    float part;
     size_t first;
     int shift; /* 0 ... FBM_PLACES_SHIFT */
     bool half, square;
@@ -44,17 +45,17 @@ typedef struct fbm_kernel {
                   float *out);
     void (*centres)(const fbm_centre_job *job, size_t count);
     void (*edges)(const fbm_edge_job *job, size_t count);
-    /* The same with coefficients by place instead of the job's own. */
+    /* The same with coefficients by place instead of the job's own. They work by eights: behind `out`, a job's scratch,
+     * noise and side[1] there must be room for 8 floats more. */
     void (*place_centres)(const fbm_centre_job *job, const fbm_place_row *row, size_t count);
     void (*place_edges)(const fbm_edge_job *job, const fbm_place_row *row, size_t count);
-    /* See fbm/places.h; exponents are in the table's range, `nodes` weighs the aspects, roots[x] is sqrt(1 - hurst[x]).
-     */
+    /* See fbm/places.h; exponents are in the table's range, `nodes` weighs the aspects, roots[x] is sqrt(1 - hurst[x]);
+     * planes are `stride` apart. */
     void (*place_unit)(const fbm_places_table *table, const float *nodes, const float *hurst, const float *roots,
-                       size_t count, float *out);
-    void (*place_scale)(const fbm_places_table *table, const float *strengths, size_t count, const float *unit,
+                       size_t count, size_t stride, float *out);
+    /* From planes `stride` apart to planes of `count`. */
+    void (*place_scale)(bool square, const float *strengths, size_t count, const float *unit, size_t stride,
                         float *out);
-    /* The values of a fbm_place_row, part of the way from those of vertices a to b. */
-    void (*place_values)(const float *a, const float *b, float part, bool square, size_t count, float *out);
     /* out[x] = strength[x] 2^(-fall hurst[x]), to 4e-7 and what rounding fall hurst costs */
     void (*strengths)(const float *strength, const float *hurst, float fall, float *out, size_t count);
     /* out[x] = (a[x] + b[x]) / 2 + t g[x]; g may be NULL */

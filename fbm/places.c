@@ -8,39 +8,24 @@
 #include <string.h>
 
 /* Taps are kept without the factor sqrt(1 - H), which bends without limit towards 1. */
-enum { KNOTS = FBM_PLACES_STEPS + 1, SQUARE_SIZE = 16, SIZE = 32 };
+enum { KNOTS = FBM_PLACES_STEPS + 1, SQUARE_SIZE = 12, SIZE = 20 };
 
 static const double knot_step = (FBM_HURST_MAX - FBM_HURST_MIN) / FBM_PLACES_STEPS;
 
-/* Coefficients by their place among a fbm_weights' values, for centres and for edges, where there are fewer than there
- * is room for. The first orbit is not among them: it has what is left of 1. Of squares one of two equal orbits is
- * enough. What they are multiplied with is in kernel.c. */
-enum { NONE = FBM_WEIGHT_VALUES };
-
-static const unsigned char square_values[SQUARE_SIZE] = {1,  3,  4,  6,  7,  9,  NONE, NONE,
-                                                         12, 14, 16, 18, 19, 20, NONE, NONE};
-static const unsigned char values_of[SIZE] = {1,    2,    3,    4,    5,    6,    7,    8,    9,    NONE, NONE,
-                                              NONE, NONE, NONE, NONE, NONE, 11,   12,   13,   14,   15,   16,
-                                              17,   18,   19,   20,   21,   NONE, NONE, NONE, NONE, NONE};
+/* Coefficients by their place among a fbm_weights' values, for centres and for edges. The first orbit is not among
+ * them: it has what is left of 1. Of squares one of two equal orbits is enough. What they are multiplied with is in
+ * kernel.c. */
+static const unsigned char square_values[SQUARE_SIZE] = {1, 3, 4, 6, 7, 9, 12, 14, 16, 18, 19, 20};
+static const unsigned char values_of[SIZE] = {1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21};
 
 static bool is_tap(unsigned char value)
 {
-    return (value >= 6 && value < 10) || (value >= 18 && value < NONE);
-}
-
-size_t fbm_places_unit_size(bool square)
-{
-    return square ? SQUARE_SIZE : SIZE;
+    return (value >= 6 && value < 10) || value >= 18;
 }
 
 size_t fbm_places_size(bool square)
 {
-    return 2 * fbm_places_unit_size(square);
-}
-
-size_t fbm_places_scratch(bool square, size_t width)
-{
-    return fbm_places_unit_size(square) * width;
+    return square ? SQUARE_SIZE : SIZE;
 }
 
 /* ---- The table --------------------------------------------------------------------------------- */
@@ -52,7 +37,7 @@ static bool is_square(double low, double high)
 
 size_t fbm_places_table_size(double low, double high)
 {
-    return KNOTS * fbm_places_unit_size(is_square(low, high)) * (low == high ? 1 : FBM_ASPECT_NODES);
+    return KNOTS * fbm_places_size(is_square(low, high)) * (low == high ? 1 : FBM_ASPECT_NODES);
 }
 
 /* What a shape changes, as Chebyshev's series in the exponent: kriging is analytic in it. */
@@ -116,20 +101,16 @@ void fbm_places_table_make(double low, double high, float *values, fbm_places_ta
     out->step = (high - low) / (FBM_ASPECT_NODES - 1);
     out->values = values;
     const unsigned char *index = square ? square_values : values_of;
-    size_t size = fbm_places_unit_size(square);
-    for (size_t k = 0; k < size; k++)
-        out->taps[k] = is_tap(index[k]) ? 1 : 0;
+    size_t size = fbm_places_size(square);
     change changes[FBM_ASPECT_NODES];
     for (int n = 0; n < out->nodes && !square; n++)
         measure_change(fbm_exp2(low + n * out->step), &changes[n]);
     for (int knot = 0; knot < KNOTS; knot++) {
-        double all[FBM_WEIGHT_VALUES + 1] = {0};
+        double all[FBM_WEIGHT_VALUES];
         knot_values(knot, all);
         for (int n = 0; n < out->nodes; n++)
             for (size_t p = 0; p < size; p++) {
-                double more = square || index[p] == NONE
-                                  ? 0
-                                  : change_at(&changes[n], index[p], 2.0 * knot / FBM_PLACES_STEPS - 1);
+                double more = square ? 0 : change_at(&changes[n], index[p], 2.0 * knot / FBM_PLACES_STEPS - 1);
                 *values++ = (float)(all[index[p]] + more);
             }
     }
@@ -160,14 +141,17 @@ void fbm_places_unit(const fbm_places_table *table, double log_aspect, const flo
         size_t n = count - x < PIECE ? count - x : PIECE;
         for (size_t k = 0; k < n; k++)
             roots[k] = sqrtf(1 - hurst[x + k]);
-        fbm_kernels()[0]->place_unit(table, nodes, hurst + x, roots, n, unit + x * fbm_places_unit_size(table->square));
+        fbm_kernels()[0]->place_unit(table, nodes, hurst + x, roots, n, count, unit + x);
     }
 }
 
-void fbm_places_scale(const fbm_places_table *table, double fall, const float *strength, const float *hurst,
-                      size_t count, const float *unit, float *strengths, float *values)
+void fbm_places_strengths(double fall, const float *strength, const float *hurst, size_t count, float *out)
 {
-    const fbm_kernel *kernel = fbm_kernels()[0];
-    kernel->strengths(strength, hurst, (float)fall, strengths, count);
-    kernel->place_scale(table, strengths, count, unit, values);
+    fbm_kernels()[0]->strengths(strength, hurst, (float)fall, out, count);
+}
+
+void fbm_places_scale(const fbm_places_table *table, const float *strengths, size_t count, const float *unit,
+                      size_t stride, float *values)
+{
+    fbm_kernels()[0]->place_scale(table->square, strengths, count, unit, stride, values);
 }

@@ -25,13 +25,15 @@ enum { FBM_PLACES_STEPS = 1004 };
 
 /* Most levels that the vertices of coefficients lie above the step's input. */
 enum { FBM_PLACES_SHIFT = 3 };
+/* Floats behind the last value that are read, too; they must be finite. */
+enum { FBM_PLACES_SPARE = 8 };
 
 typedef struct fbm_places {
     int shift;           /* 0 ... FBM_PLACES_SHIFT */
     bool square;         /* of the table that the values are of */
     fbm_window window;   /* vertices (i, j), vertices (i << shift, j << shift) of the input; they must span it */
-    const float *values; /* fbm_places_size(square) a vertex, row by row */
-    float *scratch;      /* fbm_places_scratch floats, for one call at a time */
+    const float *values; /* fbm_places_size(square) a vertex: row by row, each in planes of window.width; and
+                            FBM_PLACES_SPARE */
 } fbm_places;
 
 /* Coefficients by exponent, at knots so close that straight lines between them are within 5e-6 of the curves. */
@@ -40,7 +42,6 @@ typedef struct fbm_places_table {
     int nodes;           /* of the aspect: 1, or FBM_ASPECT_NODES */
     double low, step;    /* log2 of the first aspect, and between them */
     const float *values; /* [knot][node][fbm_places_unit_size] */
-    float taps[32];      /* 1 where a value is of the noise, else 0 */
 } fbm_places_table;
 
 /* Floats that a table needs for aspects of which `low` and `high` are the binary logarithms. */
@@ -49,18 +50,18 @@ size_t fbm_places_table_size(double low, double high);
  * one other shape, 200 ms for a range. */
 void fbm_places_table_make(double low, double high, float *values, fbm_places_table *out);
 
-/* Floats a vertex in what fbm_places_unit makes, half of them for centres and half for edges of either direction; and
- * in what fbm_places_scale makes, which has how they grow up to the next vertex of the row beside them. */
-size_t fbm_places_unit_size(bool square);
+/* Floats a vertex in what fbm_places_unit and fbm_places_scale make, those for centres before those for edges of either
+ * direction. */
 size_t fbm_places_size(bool square);
-size_t fbm_places_scratch(bool square, size_t width);
 
 /* The coefficients of a row of `count` vertices with these exponents (of FBM_HURST_MIN ... FBM_HURST_MAX) and strength
- * 1, where cells have the aspect 2^log_aspect. */
+ * 1, where cells have the aspect 2^log_aspect: planes of `count`, one a coefficient. */
 void fbm_places_unit(const fbm_places_table *table, double log_aspect, const float *hurst, size_t count, float *unit);
-/* The same with the noise multiplied by strength[x] 2^(-fall hurst[x]), of strengths >= 0 and |fall| <= 64; `strengths`
- * is scratch. */
-void fbm_places_scale(const fbm_places_table *table, double fall, const float *strength, const float *hurst,
-                      size_t count, const float *unit, float *strengths, float *values);
+/* out[x] = strength[x] 2^(-fall hurst[x]), of |fall| <= 64 */
+void fbm_places_strengths(double fall, const float *strength, const float *hurst, size_t count, float *out);
+/* Coefficients with the noise multiplied by strengths >= 0, from planes `stride` apart, so that `count` may be a part
+ * of a row. */
+void fbm_places_scale(const fbm_places_table *table, const float *strengths, size_t count, const float *unit,
+                      size_t stride, float *values);
 
 #endif

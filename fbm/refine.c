@@ -37,6 +37,13 @@ bool fbm_scheme_has_places(const fbm_scheme *scheme)
     return scheme->values == fbm_values_stationary;
 }
 
+/* An assertion whose condition counts as used where assertions are off. */
+static void require(bool met)
+{
+    assert(met);
+    (void)met;
+}
+
 /* floor(a / 2), for negative numbers too */
 static int64_t half(int64_t a)
 {
@@ -65,7 +72,7 @@ fbm_window fbm_centres_support(const fbm_scheme *scheme, fbm_window cells)
 
 /* Most columns of cells that are made at a time, so that 22 rows of scratch stay in a second-level cache. Narrower
  * strips that would fit into the first level are slower: they write the output in short pieces. */
-enum { STRIP = 2048, RING = 4, MARGIN = 8, PARTIALS = 5, ROWS = 4 * RING + PARTIALS + 1 };
+enum { STRIP = 2048, RING = 4, MARGIN = 16, PARTIALS = 5, ROWS = 4 * RING + PARTIALS + 1, LINE = 16 };
 
 /* Floats of a scratch row for n cells. Odd multiples of a cache line, lest the rows fall into the same few sets. */
 static size_t row_size(size_t n)
@@ -82,7 +89,7 @@ static size_t strip_size(size_t cells)
 
 size_t fbm_refine_scratch(size_t width)
 {
-    size_t cells = width / 2 + 1, rows = ROWS * row_size(cells < STRIP ? cells : STRIP);
+    size_t cells = width / 2 + 1, rows = ROWS * row_size(cells < STRIP ? cells : STRIP) + LINE;
     return rows > fbm_classic_scratch() ? rows : fbm_classic_scratch();
 }
 
@@ -156,6 +163,7 @@ static void start(walk *w, const fbm_kernel *kernel, const fbm_step *step, const
 {
     *w = (walk){.kernel = kernel, .step = step, .in = in, .map = map, .from = from, .noisy = step->amplitude != 0};
     size_t size = row_size(strip_size(cells));
+    scratch += -((uintptr_t)scratch / sizeof *scratch) % LINE;
     float **rows[] = {w->centre, w->centre_noise, w->row_noise, w->column_noise};
     for (int k = 0; k < 4; k++)
         for (int r = 0; r < RING; r++, scratch += size)
@@ -172,23 +180,26 @@ static const fbm_weights *weights_at(const walk *w, int64_t j, bool between)
     return step->rows ? step->rows + (2 * j + between - step->first_row) : &step->weights;
 }
 
-/* The coefficients of points in a row of input row j, from column i on, made in the places' scratch. */
+/* The coefficients of points in a row of input row j, from column i on. */
 static fbm_place_row place_row(const walk *w, fbm_noise_kind kind, int64_t i, int64_t j, size_t count)
 {
     const fbm_places *places = w->step->places;
     const fbm_window *at = &places->window;
     const int shift = places->shift;
-    const size_t unit = (size_t)2 << shift, all = fbm_places_size(places->square);
+    const size_t unit = (size_t)2 << shift, planes = fbm_places_size(places->square);
     const size_t down = (size_t)(2 * (j - at->j * ((int64_t)1 << shift)) + (kind != FBM_NOISE_ROW_EDGES));
-    const size_t first = (size_t)(i - at->i * ((int64_t)1 << shift)), begin = first >> shift;
-    const size_t row = down >> (shift + 1), vertices = ((first + count - 1) >> shift) + 1 - begin;
+    const size_t first = (size_t)(i - at->i * ((int64_t)1 << shift)), row = down >> (shift + 1);
     const float part = (float)(down & (unit - 1)) / (float)unit;
-    const float *from = places->values + (row * at->width + begin) * all + (kind != FBM_NOISE_CENTRES ? all / 2 : 0);
-    assert(i >= at->i * ((int64_t)1 << shift) && begin + vertices <= at->width && row + (part > 0) < at->height);
-    w->kernel->place_values(from, from + (part > 0 ? at->width * all : 0), part, places->square, vertices,
-                            places->scratch);
-    return (fbm_place_row){.values = places->scratch,
-                           .first = first & ((unit / 2) - 1),
+    const float *from = places->values + row * at->width * planes;
+    if (kind != FBM_NOISE_CENTRES)
+        from += (places->square ? 6 : 9) * at->width;
+    require(i >= at->i * ((int64_t)1 << shift) && (first + count - 1) >> shift < at->width &&
+            row + (part > 0) < at->height);
+    return (fbm_place_row){.above = from,
+                           .below = part > 0 ? from + at->width * planes : from,
+                           .stride = at->width,
+                           .part = part,
+                           .first = first,
                            .shift = shift,
                            .half = kind != FBM_NOISE_COLUMN_EDGES,
                            .square = places->square};
@@ -268,6 +279,10 @@ static void stencil_row_edges(const walk *w, int64_t j)
         job.same[k] = ring_row(w->centre, j - 2 + k) + 1;
     for (int k = 0; k < 2; k++)
         job.other[k] = ring_row(w->column_noise, j - 1 + k);
+    if (w->step->places) { /* the input has no room behind it */
+        memcpy(w->partial[PARTIALS - 1], job.side[1], (w->count + 3) * sizeof *job.out);
+        job.side[1] = w->partial[PARTIALS - 1];
+    }
     make_edges(w, FBM_NOISE_ROW_EDGES, j, &job);
 }
 
@@ -405,13 +420,6 @@ static bool contains(fbm_window outer, fbm_window inner)
            inner.j + (int64_t)inner.height <= outer.j + (int64_t)outer.height && outer.stride >= outer.width;
 }
 
-/* An assertion whose condition counts as used where assertions are off. */
-static void require(bool met)
-{
-    assert(met);
-    (void)met;
-}
-
 void fbm_refine_by(const fbm_kernel *kernel, const fbm_step *step, const float *in, const float *map,
                    fbm_window in_window, float *out, fbm_window out_window, float *scratch)
 {
@@ -460,7 +468,10 @@ void fbm_centres_by(const fbm_kernel *kernel, const fbm_step *step, const float 
             float *row = out + y * cells.stride + x;
             if (ring)
                 make_noise(&w, w.centre_noise, FBM_NOISE_CENTRES, j + 1, i - 1, count + 2);
-            if (step->scheme->rule == RULE_STENCIL24)
+            if (step->places) { /* which are made by eights */
+                stencil_centres(&w, i, j, count, w.edge);
+                memcpy(row, w.edge, count * sizeof *row);
+            } else if (step->scheme->rule == RULE_STENCIL24)
                 stencil_centres(&w, i, j, count, row);
             else
                 mean_centres(&w, i, j, count, row);

@@ -79,24 +79,21 @@ static fbm_places make_places(const fbm_kernel *kernel, const fbm_places_table *
 {
     fbm_window w = spanning(from, shift);
     bool square = table->square;
-    float *values = allocate(w.width * w.height * fbm_places_size(square)), roots[512], nodes[] = {1};
-    float *unit = allocate(w.width * fbm_places_unit_size(square)), *strengths = allocate(w.width);
+    float *values = calloc(w.width * w.height * fbm_places_size(square) + FBM_PLACES_SPARE, sizeof *values), roots[512],
+          nodes[] = {1};
+    float *unit = allocate(w.width * fbm_places_size(square)), *strengths = allocate(w.width);
     assert_true(w.width <= 512);
     for (size_t y = 0; y < w.height; y++) {
         size_t at = ((size_t)(w.j - f->window.j) + y) * f->window.width + (size_t)(w.i - f->window.i);
         for (size_t x = 0; x < w.width; x++)
             roots[x] = sqrtf(1 - f->hurst[at + x]);
-        kernel->place_unit(table, nodes, f->hurst + at, roots, w.width, unit);
+        kernel->place_unit(table, nodes, f->hurst + at, roots, w.width, w.width, unit);
         kernel->strengths(f->strength + at, f->hurst + at, (float)fall, strengths, w.width);
-        kernel->place_scale(table, strengths, w.width, unit, values + y * w.width * fbm_places_size(square));
+        kernel->place_scale(square, strengths, w.width, unit, w.width, values + y * w.width * fbm_places_size(square));
     }
     free(unit);
     free(strengths);
-    return (fbm_places){.shift = shift,
-                        .square = square,
-                        .window = w,
-                        .values = values,
-                        .scratch = allocate(fbm_places_scratch(square, w.width))};
+    return (fbm_places){.shift = shift, .square = square, .window = w, .values = values};
 }
 
 static float *refine(const fbm_kernel *kernel, const fbm_places_table *table, fbm_step step, double fall,
@@ -107,7 +104,6 @@ static float *refine(const fbm_kernel *kernel, const fbm_places_table *table, fb
     step.places = &places;
     fbm_refine_by(kernel, &step, in, NULL, from, out, to, scratch);
     free((float *)places.values);
-    free(places.scratch);
     free(scratch);
     return out;
 }
@@ -251,7 +247,7 @@ static void centresWithPlacesEqualTheOddSamples(void **state)
             for (size_t x = 0; x < 61; x++)
                 assert_true(out[y * 61 + x] == all[(2 * y + 1) * 122 + 2 * x + 1]);
         free(in), free(some), free(out), free(all), free(scratch);
-        free((float *)places.values), free(places.scratch);
+        free((float *)places.values);
         free_fields(&f);
     }
 }
@@ -362,13 +358,13 @@ static void weights_of(const float *unit, fbm_weights *out)
     out->centre_taps[0] = unit[3];
     out->centre_taps[1] = out->centre_taps[2] = unit[4];
     out->centre_taps[3] = unit[5];
-    out->edge[2] = out->edge[3] = unit[8];
-    out->edge[4] = out->edge[5] = unit[9];
-    out->edge[6] = out->edge[7] = unit[10];
-    out->edge[0] = out->edge[1] = .25F - 2 * unit[8] - unit[9] - 2 * unit[10];
-    out->edge_taps[0] = unit[11];
-    out->edge_taps[1] = unit[12];
-    out->edge_taps[2] = out->edge_taps[3] = unit[13];
+    out->edge[2] = out->edge[3] = unit[6];
+    out->edge[4] = out->edge[5] = unit[7];
+    out->edge[6] = out->edge[7] = unit[8];
+    out->edge[0] = out->edge[1] = .25F - 2 * unit[6] - unit[7] - 2 * unit[8];
+    out->edge_taps[0] = unit[9];
+    out->edge_taps[1] = unit[10];
+    out->edge_taps[2] = out->edge_taps[3] = unit[11];
 }
 
 /* Between the knots, where lines are farthest from the curves: the structure function, exactly propagated, moves by no

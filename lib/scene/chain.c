@@ -27,7 +27,7 @@ typedef struct work {
     float *planes[2][SCENE_PLANES];
     fbm_window fields[STAGES + 1];
     int field; /* the stage that the coefficients of strength 1 are of, -1: none */
-    float *unit, *values, *strengths, *place_scratch;
+    float *unit, *values, *strengths;
     float *faded, *halved; /* of halvings by place: strengths of the noise, and a result for one exponent */
     float *made;           /* NULL: it is made in its place */
     float *scratch;
@@ -144,7 +144,6 @@ static void work_free(work *w)
     free(w->unit);
     free(w->values);
     free(w->strengths);
-    free(w->place_scratch);
     free(w->faded);
     free(w->halved);
     free(w->made);
@@ -173,22 +172,19 @@ static bool allocate_planes(work *w, const size_t most[2])
 /* Room for the coefficients of any stage. */
 static bool allocate_places(work *w)
 {
-    size_t most = 1, widest = 1, last = (size_t)(w->stages + w->centres);
+    size_t most = 1, values, last = (size_t)(w->stages + w->centres);
     for (size_t s = (size_t)w->chain->shape.halvings; s < last; s++) {
         fbm_window of = w->fields[field_of(w, (int)s)];
         most = larger(most, of.width * of.height); /* no more than the heights, whose size is checked */
-        widest = larger(widest, of.width);
     }
-    bool square = w->chain->places.square;
-    size_t units, values;
-    if (!tl_size_mul(most, fbm_places_unit_size(square), &units) ||
-        !tl_size_mul(most, fbm_places_size(square), &values))
+    if (!tl_size_mul(most, fbm_places_size(w->chain->places.square), &values))
         return false;
-    w->unit = tl_alloc(units, sizeof(float));
-    w->values = tl_alloc(values, sizeof(float));
-    w->strengths = tl_alloc(widest, sizeof(float));
-    w->place_scratch = tl_alloc(fbm_places_scratch(square, widest), sizeof(float));
-    return w->unit && w->values && w->strengths && w->place_scratch;
+    w->unit = tl_alloc(values, sizeof(float));
+    w->values = tl_alloc(values + FBM_PLACES_SPARE, sizeof(float));
+    w->strengths = tl_alloc(most, sizeof(float));
+    if (w->values)
+        memset(w->values, 0, (values + FBM_PLACES_SPARE) * sizeof(float));
+    return w->unit && w->values && w->strengths;
 }
 
 /* Room for every window of the plan but the one that is written straight to the caller. */
@@ -325,7 +321,7 @@ static void advance_fields(work *w, int stage)
     for (size_t row = 0; row < of->height; row++) {
         double log = c->tables ? log_aspect(&c->shape, (double)(of->j + (int64_t)row) * unit) : c->places.low;
         fbm_places_unit(&c->places, log, w->planes[wanted & 1][SCENE_HURST] + row * of->width, of->width,
-                        w->unit + row * of->width * fbm_places_unit_size(c->places.square));
+                        w->unit + row * of->width * fbm_places_size(c->places.square));
     }
 }
 
@@ -335,19 +331,17 @@ static fbm_places places_at(work *w, int stage)
     const scene_chain *c = w->chain;
     advance_fields(w, stage);
     int field = w->field;
-    const bool square = c->places.square;
+    const size_t size = fbm_places_size(c->places.square);
     const fbm_window *of = &w->fields[field], window = vertices_of(w, stage);
     const double fall = c->fall + (double)(stage - c->shape.halvings);
-    const size_t first = (size_t)(window.i - of->i);
+    fbm_places_strengths(fall, w->planes[field & 1][SCENE_STRENGTH], w->planes[field & 1][SCENE_HURST],
+                         of->width * of->height, w->strengths);
     for (size_t row = 0; row < window.height; row++) {
-        size_t at = (row + (size_t)(window.j - of->j)) * of->width + first;
-        fbm_places_scale(&c->places, fall, w->planes[field & 1][SCENE_STRENGTH] + at,
-                         w->planes[field & 1][SCENE_HURST] + at, window.width,
-                         w->unit + at * fbm_places_unit_size(square), w->strengths,
-                         w->values + row * window.width * fbm_places_size(square));
+        size_t line = (row + (size_t)(window.j - of->j)) * of->width, first = (size_t)(window.i - of->i);
+        fbm_places_scale(&c->places, w->strengths + line + first, window.width, w->unit + line * size + first,
+                         of->width, w->values + row * window.width * size);
     }
-    return (fbm_places){
-        .shift = stage - field, .square = square, .window = window, .values = w->values, .scratch = w->place_scratch};
+    return (fbm_places){.shift = stage - field, .square = c->places.square, .window = window, .values = w->values};
 }
 
 /* An exponent's place among the exponents of halvings. */

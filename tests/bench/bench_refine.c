@@ -21,7 +21,7 @@ typedef struct chain {
     /* Coefficients by place: from fields on level 0. */
     fbm_places_table table;
     fbm_places places[LEVELS];
-    float *table_values, *unit, *values, *place_scratch, *strength, *hurst, *strengths;
+    float *table_values, *unit, *values, *strength, *hurst, *strengths;
 } chain;
 
 static void *allocate(size_t count, size_t size)
@@ -61,10 +61,9 @@ static void plan_places(chain *c)
     size_t count = nodes->width * nodes->height, size = fbm_places_size(true);
     c->table_values = allocate(fbm_places_table_size(0, 0), sizeof(float));
     fbm_places_table_make(0, 0, c->table_values, &c->table);
-    c->unit = allocate(count * fbm_places_unit_size(true), sizeof(float));
-    c->values = allocate(count * size, sizeof(float));
+    c->unit = allocate(count * fbm_places_size(true), sizeof(float));
+    c->values = allocate(count * size + FBM_PLACES_SPARE, sizeof(float));
     c->strengths = allocate(count, sizeof(float));
-    c->place_scratch = allocate(fbm_places_scratch(true, nodes->width), sizeof(float));
     c->strength = allocate(count, sizeof(float));
     c->hurst = allocate(count, sizeof(float));
     for (size_t k = 0; k < count; k++) {
@@ -72,8 +71,7 @@ static void plan_places(chain *c)
         c->hurst[k] = .3F + (float)(k % nodes->width) / 100;
     }
     for (int l = 0; l < LEVELS; l++)
-        c->places[l] = (fbm_places){
-            .shift = l, .square = true, .window = *nodes, .values = c->values, .scratch = c->place_scratch};
+        c->places[l] = (fbm_places){.shift = l, .square = true, .window = *nodes, .values = c->values};
 }
 
 static void run_places(void *context)
@@ -82,11 +80,12 @@ static void run_places(void *context)
     const fbm_window *nodes = &c->windows[0];
     for (size_t row = 0; row < nodes->height; row++)
         fbm_places_unit(&c->table, 0, c->hurst + row * nodes->width, nodes->width,
-                        c->unit + row * nodes->width * fbm_places_unit_size(true));
+                        c->unit + row * nodes->width * fbm_places_size(true));
     for (int l = c->first; l < LEVELS; l++) {
+        fbm_places_strengths(l, c->strength, c->hurst, nodes->width * nodes->height, c->strengths);
         for (size_t row = 0; row < nodes->height; row++)
-            fbm_places_scale(&c->table, l, c->strength + row * nodes->width, c->hurst + row * nodes->width,
-                             nodes->width, c->unit + row * nodes->width * fbm_places_unit_size(true), c->strengths,
+            fbm_places_scale(&c->table, c->strengths + row * nodes->width, nodes->width,
+                             c->unit + row * nodes->width * fbm_places_size(true), nodes->width,
                              c->values + row * nodes->width * fbm_places_size(true));
         fbm_step step = c->steps[l];
         step.places = &c->places[l];
@@ -101,7 +100,6 @@ static void finish(chain *c)
     free(c->unit);
     free(c->values);
     free(c->strengths);
-    free(c->place_scratch);
     free(c->strength);
     free(c->hurst);
     for (int l = 0; l <= LEVELS; l++)
