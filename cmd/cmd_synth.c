@@ -78,15 +78,17 @@ static tl_status write_samples(const settings *set, const tl_source *made, const
     if (set->preset)
         return write_preset(set, made, run, error);
     tl_mip usual = made->info.type == TL_RASTER_AREA ? TL_MIP_BOX : TL_MIP_LATTICE;
-    const tl_write_options options = {.overwrite = set->common.overwrite,
-                                      .cog = set->cog,
-                                      .lerc_error = set->lerc_error,
-                                      .half_error = set->half ? set->quantum / 2 : 0,
-                                      .validity = set->common.voids && strcmp(set->common.voids, "keep") != 0,
-                                      .compression = (tl_compression)set->compression,
-                                      .mip = set->cog && !set->mip_given ? usual : (tl_mip)set->mip,
-                                      .frame = (tl_frame)set->frame,
-                                      .run = run};
+    tl_write_options options = {.overwrite = set->common.overwrite,
+                                .texture_size = (int)set->common.texture_size,
+                                .cog = set->cog,
+                                .lerc_error = set->lerc_error,
+                                .half_error = set->half ? set->quantum / 2 : 0,
+                                .validity = set->common.voids && strcmp(set->common.voids, "keep") != 0,
+                                .compression = (tl_compression)set->compression,
+                                .mip = set->cog && !set->mip_given ? usual : (tl_mip)set->mip,
+                                .frame = (tl_frame)set->frame,
+                                .run = run};
+    command_textures(&set->common, &options.textures);
     return tl_write_grid(made, set->common.output, &options, error);
 }
 
@@ -256,6 +258,9 @@ static bool layers_ok(const settings *set)
 static bool grid_output_ok(const settings *set)
 {
     if (!layers_ok(set))
+        return false;
+    unsigned textures;
+    if (!command_textures(&set->common, &textures))
         return false;
     if (set->preset && (set->mip || set->compression || set->cog)) {
         complain("--preset decides how files are written; leave --mip, --compression and --cog away");
@@ -520,7 +525,7 @@ static void list_schemes(bool noise)
 
 /* What synth and noise write, and how. */
 #define GRID_OUTPUT(s)                                                                                                \
-    COMMON_OUTPUT((s).common),                                                                                        \
+    COMMON_OUTPUT((s).common), TEXTURE_OPTIONS((s).common),                                                           \
         {"compression",                                                                                               \
          0,                                                                                                           \
          OPTION_CHOICE,                                                                                               \
@@ -660,7 +665,7 @@ static int run_synth(const command *self, int argc, const char **argv, bool help
     const option output[] = {GRID_OUTPUT(set),
                              {"layers", 0, OPTION_TEXT, &set.layers, NULL, "KINDS",
                               "write these beside the heights, with commas between: normal, tangent, slope, curvature, "
-                              "splat, colour, sigma",
+                              "splat, colour, albedo, sigma",
                               0, 0, NULL},
                              {"layer-format", 0, OPTION_CHOICE, &set.layer_format, NULL, "FORMAT",
                               "of the layers (default: exr)", 0, 0, layer_formats},

@@ -59,11 +59,17 @@ static int print_json(const tl_lod_stats *stats, const tl_view_report *measured)
 }
 
 /* The mesh, the picture, or both. */
-static tl_status write_outputs(const settings *set, const tl_mesh *mesh, const tl_source *dem, const tl_view *view,
+static tl_status write_outputs(const settings *set, const tl_mesh *mesh, const lod_ground *ground, const tl_view *view,
                                const tl_run *run, tl_error *error)
 {
-    const tl_write_options writing = {
-        .overwrite = set->common.overwrite, .frame = (tl_frame)set->frame, .parent_heights = set->morph, .run = run};
+    const tl_source *dem = ground->opened.source;
+    tl_write_options writing = {.overwrite = set->common.overwrite,
+                                .frame = (tl_frame)set->frame,
+                                .parent_heights = set->morph,
+                                .ground = ground->field,
+                                .texture_size = (int)set->common.texture_size,
+                                .run = run};
+    command_textures(&set->common, &writing.textures);
     tl_view_picture_options look = set->picture.look;
     look.overwrite = set->common.overwrite;
     look.run = run;
@@ -106,7 +112,7 @@ static int write_view(const settings *set, const lod_ground *ground, const tl_ru
                            &error);
     progress_stage(bar, "writing");
     if (status == TL_OK)
-        status = write_outputs(set, mesh, ground->opened.source, &view, run, &error);
+        status = write_outputs(set, mesh, ground, &view, run, &error);
     double seconds = progress_end(bar);
     if (status == TL_OK && set->measure) {
         progress_stage(bar, "measuring the picture");
@@ -167,6 +173,7 @@ static int run(const command *self, int argc, const char **argv, bool help)
                               {0}};
     const option input[] = {COMMON_INPUT(set.common), {0}};
     const option output[] = {COMMON_OUTPUT(set.common),
+                             TEXTURE_OPTIONS(set.common),
                              {"frame", 0, OPTION_CHOICE, &set.frame, NULL, "FRAME",
                               "coordinates of the mesh (default: enu where the CRS is known)", 0, 0, frame_names},
                              {"morph", 0, OPTION_FLAG, &set.morph, NULL, NULL,
@@ -183,8 +190,10 @@ static int run(const command *self, int argc, const char **argv, bool help)
     if (!command_begin(self, argc, argv, help, groups, -1, &rest, &status))
         return status;
     bool mesh = set.common.output || !(set.picture.picture || set.measure);
+    unsigned textures;
     bool good = view_options_ok(&set.view) && lod_options_ok(&set.lod) && picture_options_ok(&set.picture) &&
-                (!mesh || command_output_ok(&set.common, false, true)) && morph_ok(&set);
+                (!mesh || command_output_ok(&set.common, false, true)) && morph_ok(&set) &&
+                command_textures(&set.common, &textures);
     status = good ? view(&set, &rest) : EXIT_USAGE;
     arguments_free(&rest);
     return status;

@@ -250,6 +250,33 @@ bool command_ends_with(const char *path, const char *ending)
     return length > end && strcasecmp(path + length - end, ending) == 0;
 }
 
+bool command_textures(const common *options, unsigned *out)
+{
+    static const char *const names[] = {"colour", "normal"}; /* by tl_texture's bits */
+    const char *at = options->textures;
+    *out = 0;
+    if (!at && !options->texture_size)
+        return true;
+    if (!at || !command_ends_with(options->output, ".glb")) {
+        complain(at ? "--texture is for .glb; other formats have none" : "--texture-size is for --texture KINDS");
+        return false;
+    }
+    for (size_t length; at; at = at[length] ? at + length + 1 : NULL) {
+        length = strcspn(at, ",");
+        int k = 0;
+        while (k < 2 && (strlen(names[k]) != length || strncmp(at, names[k], length) != 0))
+            k++;
+        if (k == 2) {
+            char word[32];
+            snprintf(word, sizeof word, "%.*s", (int)length, at);
+            complain_of_choice("texture", word, names, 2, sizeof *names);
+            return false;
+        }
+        *out |= 1u << k;
+    }
+    return true;
+}
+
 bool command_output_ok(const common *options, bool grid, bool mesh)
 {
     if (!options->output || !*options->output) {

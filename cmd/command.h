@@ -34,8 +34,10 @@ typedef struct common {
     bool nodata_given;
     int64_t band; /* 0: the first */
     int64_t threads;
-    int64_t memory; /* MB; 0: DEFAULT_MEMORY */
-    int progress;   /* index into the names of progress_style */
+    int64_t memory;       /* MB; 0: DEFAULT_MEMORY */
+    const char *textures; /* colour,normal; see command_textures */
+    int64_t texture_size;
+    int progress; /* index into the names of progress_style */
 } common;
 
 /* The rows of the options in a `common`, for use inside of an array of options. */
@@ -112,6 +114,21 @@ typedef struct common {
     {                                                                                                          \
         "overwrite", 0, OPTION_FLAG, &(c).overwrite, NULL, NULL, "replace the output if it exists", 0, 0, NULL \
     }
+#define TEXTURE_OPTIONS(c)                                                                  \
+    {"texture",                                                                             \
+     0,                                                                                     \
+     OPTION_TEXT,                                                                           \
+     &(c).textures,                                                                         \
+     NULL,                                                                                  \
+     "KINDS",                                                                               \
+     "of a .glb: pictures of the ground in it: colour, normal or colour,normal",            \
+     0,                                                                                     \
+     0,                                                                                     \
+     NULL},                                                                                 \
+    {                                                                                       \
+        "texture-size", 0, OPTION_INTEGER, &(c).texture_size, NULL, "N",                    \
+            "texels on a side of these, at most, 1...16384 (default: 4096)", 1, 16384, NULL \
+    }
 #define COMMON_RUNNING(c)                                                                                              \
     {"threads", 't', OPTION_INTEGER, &(c).threads, NULL, "N", "worker threads, 1...512 (default: one a processor)", 1, \
      512,       NULL},                                                                                                 \
@@ -178,6 +195,9 @@ __attribute__((format(printf, 2, 3))) void command_say(const common *options, co
 /* Flushes stdout; EXIT_DONE, or EXIT_FAILED with a message when it could not be written. */
 int command_done(void);
 /* Whether a name, or NULL, ends like this, in upper or lower case; one that is nothing but the ending does not. */
+/* The tl_texture values of the option --texture, added; told and false where it names others or the output is no .glb.
+ */
+bool command_textures(const common *options, unsigned *out);
 bool command_ends_with(const char *path, const char *ending);
 
 /* Whether an output was named and has an ending that talus writes as `grid` or `mesh`; else told. */

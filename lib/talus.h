@@ -1003,6 +1003,11 @@ typedef enum tl_mesh_coding {
     TL_CODING_COMPRESSED, /* the same, encoded by EXT_meshopt_compression: a tenth, for readers that know it */
 } tl_mesh_coding;
 
+typedef enum tl_texture {
+    TL_TEXTURE_COLOUR = 1, /* colours by height, without light */
+    TL_TEXTURE_NORMAL = 2,
+} tl_texture;
+
 typedef struct tl_write_options {
     bool overwrite; /* replace an existing file; else TL_ERROR_IO */
     bool validity;  /* of grids, not meshes: also write each sample's tl_validity, to NAME.validity.tif for NAME.exr */
@@ -1020,6 +1025,12 @@ typedef struct tl_write_options {
     /* GLB, of meshes that tl_mesh_parent_heights knows: also write these, as the attribute _PARENT_HEIGHT, and the ways
      * there as a morph target, "parent". */
     bool parent_heights;
+    /* GLB: textures of this source, over whose finest lattice the mesh lies: tl_texture values, added. Texels are
+     * samples of its finest level that has at most texture_size (0: 4096) a side, a PNG each. With TL_TEXTURE_NORMAL
+     * the vertices' own normals point up and tangents along rows: the texture holds the slopes, in metres. */
+    const tl_source *ground;
+    unsigned textures;
+    int texture_size;
     const tl_run *run;
 } tl_write_options;
 

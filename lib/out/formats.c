@@ -115,8 +115,10 @@ static tl_status write_as_mesh(const tl_source *source, const char *path, const 
         return TL_ERROR_IO;
     tl_mesh *mesh = NULL;
     tl_status status = tl_mesh_from_source(source, options->run, &mesh, error);
+    tl_write_options writing = *options;
+    writing.ground = source;
     if (status == TL_OK)
-        status = write(mesh, output, options, error);
+        status = write(mesh, output, &writing, error);
     tl_mesh_destroy(mesh);
     return finish(output, status, error);
 }

@@ -1,12 +1,13 @@
-/* glTF 2.0 binary (GLB): one mesh with positions and normals, in meshoptimizer's order for the vertex cache and fetch.
- * Plain, it has floats. Quantised (KHR_mesh_quantization), positions are 16-bit steps from the mesh's lowest corner, by
- * a scale and a translation of the node, an axis each: heights have finer steps than the ground. Compressed, these are
- * encoded by meshoptimizer (EXT_meshopt_compression), losslessly. */
+/* glTF 2.0 binary (GLB): one mesh with positions and normals, textures on request, in meshoptimizer's order for the
+ * vertex cache and fetch. Plain, it has floats. Quantised (KHR_mesh_quantization), positions are 16-bit steps from the
+ * mesh's lowest corner, by a scale and a translation of the node, an axis each: heights have finer steps than the
+ * ground. Compressed, these are encoded by meshoptimizer (EXT_meshopt_compression), losslessly. */
 #include "lib/base/error.h"
 #include "lib/base/parallel.h"
 #include "lib/base/size.h"
 #include "lib/out/frame.h"
 #include "lib/out/out.h"
+#include "lib/out/texture.h"
 
 #include <jansson.h>
 #include <meshoptimizer.h>
@@ -22,7 +23,10 @@ enum {
     COMPONENT_U16 = 5123,
     COMPONENT_U32 = 5125,
     COMPONENT_FLOAT = 5126,
-    MODE_TRIANGLES = 4
+    MODE_TRIANGLES = 4,
+    LINEAR = 9729,
+    LINEAR_MIPMAP_LINEAR = 9987,
+    CLAMP_TO_EDGE = 33071
 };
 
 typedef struct vertex {
@@ -40,8 +44,9 @@ typedef struct view {
     unsigned char *bytes;
     size_t size;          /* of the bytes */
     size_t count, stride; /* of the items, decoded */
-    const char *mode;     /* of EXT_meshopt_compression */
-    int target;
+    const char *mode;     /* of EXT_meshopt_compression; NULL: never encoded */
+    int target;           /* 0: none */
+    tl_output *file;      /* where the bytes are, if not in memory: a PNG */
 } view;
 
 /* How a vertex moves to where the surface was before it came, and its height there. */
@@ -49,7 +54,17 @@ typedef struct morph {
     float by[3], height;
 } morph;
 
-enum { VIEWS = 4 };
+/* How textures lie on the surface. */
+typedef struct skin {
+    float tangent[4], uv[2];
+} skin;
+
+enum { VIEWS = 8, AXES = 9 /* places along each side of the mesh where directions are known */ };
+
+/* Axes of the ground in the frame's own: along columns, and up. */
+typedef struct ground_axes {
+    double along[3], up[3];
+} ground_axes;
 
 typedef struct model {
     tl_mesh_coding coding;
@@ -59,6 +74,12 @@ typedef struct model {
     int view_count;
     vertex *vertices;
     morph *morphs; /* NULL: not asked for */
+    skin *skins;   /* the same */
+    unsigned textures;
+    out_texture texture;
+    ground_axes *axes_at; /* AXES x AXES over the texture; NULL: no tangents */
+    double turn;          /* 1, or -1 where the frame is mirrored */
+    int indices_view, morph_view, tangent_view, uv_view, image_view;
     size_t vertex_count;
     uint32_t *indices;
     size_t index_count;
@@ -165,30 +186,188 @@ static tl_status place_morphs(const tl_mesh *mesh, out_frame *frame, const verte
     return status;
 }
 
+/* Puts an array beside the vertices, which may be NULL, into their order. */
+static bool remap_more(void **items, size_t count, size_t size, const uint32_t *remap)
+{
+    if (!*items)
+        return true;
+    void *ordered = tl_alloc(count, size);
+    if (!ordered)
+        return false;
+    meshopt_remapVertexBuffer(ordered, *items, count, size, remap);
+    free(*items);
+    *items = ordered;
+    return true;
+}
+
 /* Vertices in the order in which triangles ask for them; m->vertices has room for all. */
 static tl_status order_vertices(model *m, const vertex *placed, const char *path, tl_error *error)
 {
-    if (!m->morphs) {
+    if (!m->morphs && !m->skins) {
         m->vertex_count = meshopt_optimizeVertexFetch(m->vertices, m->indices, m->index_count, placed, m->vertex_count,
                                                       sizeof *placed);
         return TL_OK;
     }
     size_t count = m->vertex_count;
     uint32_t *remap = tl_alloc(count, sizeof *remap);
-    morph *ordered = tl_alloc(count, sizeof *ordered);
-    if (!remap || !ordered) {
-        free(remap);
-        free(ordered);
+    if (!remap)
         return tl_fail_memory(error, path);
-    }
     m->vertex_count = meshopt_optimizeVertexFetchRemap(remap, m->indices, m->index_count, count);
     meshopt_remapVertexBuffer(m->vertices, placed, count, sizeof *placed, remap);
-    meshopt_remapVertexBuffer(ordered, m->morphs, count, sizeof *ordered, remap);
+    bool good = remap_more((void **)&m->morphs, count, sizeof *m->morphs, remap) &&
+                remap_more((void **)&m->skins, count, sizeof *m->skins, remap);
     meshopt_remapIndexBuffer(m->indices, m->indices, m->index_count, remap);
     free(remap);
-    free(m->morphs);
-    m->morphs = ordered;
+    return good ? TL_OK : tl_fail_memory(error, path);
+}
+
+/* ---- Textures ---- */
+
+static void difference(const double a[3], const double b[3], double out[3])
+{
+    for (int k = 0; k < 3; k++)
+        out[k] = a[k] - b[k];
+}
+
+static void cross(const double a[3], const double b[3], double out[3])
+{
+    for (int k = 0; k < 3; k++)
+        out[k] = a[(k + 1) % 3] * b[(k + 2) % 3] - a[(k + 2) % 3] * b[(k + 1) % 3];
+}
+
+static void scale_to_one(double v[3])
+{
+    double length = sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]);
+    for (int k = 0; k < 3 && length > 0; k++)
+        v[k] /= length;
+}
+
+/* Directions at a place of the mesh, by places one sample away; `height` makes no matter. */
+static tl_status find_axes(const tl_mesh *mesh, out_frame *frame, const out_texture *t, double u, double v,
+                           ground_axes *out, double *turn, tl_error *error)
+{
+    int32_t i = (int32_t)llrint((double)t->low[0] + u * (double)(t->high[0] - t->low[0]));
+    int32_t j = (int32_t)llrint((double)t->low[1] + v * (double)(t->high[1] - t->low[1]));
+    int32_t before[2] = {i > t->low[0] ? i - 1 : i, j > t->low[1] ? j - 1 : j};
+    int32_t behind[2] = {i < t->high[0] ? i + 1 : i, j < t->high[1] ? j + 1 : j};
+    float z = mesh->vertices[0].z;
+    const tl_vertex around[4] = {{before[0], j, z}, {behind[0], j, z}, {i, behind[1], z}, {i, before[1], z}};
+    double xyz[4][3], at[4][3], north[3], up[3];
+    tl_status status = out_frame_apply(frame, around, 4, xyz, error);
+    for (int k = 0; k < 4 && status == TL_OK; k++)
+        to_gltf(xyz[k], at[k]);
+    if (status != TL_OK)
+        return status;
+    difference(at[1], at[0], out->along);
+    difference(at[3], at[2], north);
+    scale_to_one(out->along);
+    scale_to_one(north);
+    cross(out->along, north, up);
+    scale_to_one(up);
+    *turn = up[1] < 0 ? -1 : 1;
+    for (int k = 0; k < 3; k++)
+        out->up[k] = *turn * up[k];
     return TL_OK;
+}
+
+static tl_status find_all_axes(const tl_mesh *mesh, out_frame *frame, model *m, tl_error *error)
+{
+    tl_status status = TL_OK;
+    m->axes_at = tl_alloc(AXES * AXES, sizeof *m->axes_at);
+    if (!m->axes_at)
+        return tl_fail_memory(error, "the textures");
+    for (int k = 0; k < AXES * AXES && status == TL_OK; k++)
+        status = find_axes(mesh, frame, &m->texture, k % AXES / (AXES - 1.0), k / AXES / (AXES - 1.0), &m->axes_at[k],
+                           &m->turn, error);
+    return status;
+}
+
+/* Between the places where they are known: they turn by at most degrees over a whole raster. */
+static void mix_axes(const model *m, double u, double v, ground_axes *out)
+{
+    int x = u < 1 ? (int)(u * (AXES - 1)) : AXES - 2, y = v < 1 ? (int)(v * (AXES - 1)) : AXES - 2;
+    double a = u * (AXES - 1) - x, b = v * (AXES - 1) - y;
+    const ground_axes *at = m->axes_at + y * AXES + x;
+    for (int k = 0; k < 3; k++) {
+        out->along[k] = (1 - b) * ((1 - a) * at[0].along[k] + a * at[1].along[k]) +
+                        b * ((1 - a) * at[AXES].along[k] + a * at[AXES + 1].along[k]);
+        out->up[k] = (1 - b) * ((1 - a) * at[0].up[k] + a * at[1].up[k]) +
+                     b * ((1 - a) * at[AXES].up[k] + a * at[AXES + 1].up[k]);
+    }
+    scale_to_one(out->along);
+    scale_to_one(out->up);
+}
+
+static double share(int64_t low, int64_t high, int64_t at)
+{
+    return high > low ? (double)(at - low) / (double)(high - low) : 0;
+}
+
+/* Fills m->skins, of vertices in the mesh's order, and, where the texture has the normals, makes theirs point up. */
+static void place_skins(const tl_mesh *mesh, vertex *placed, model *m)
+{
+    const out_texture *t = &m->texture;
+    for (size_t k = 0; k < mesh->vertex_count; k++) {
+        const tl_vertex *v = &mesh->vertices[k];
+        skin *s = &m->skins[k];
+        *s = (skin){{0}, {0}};
+        out_texture_place(t, v->i, v->j, s->uv);
+        if (!m->axes_at)
+            continue;
+        ground_axes axes;
+        mix_axes(m, share(t->low[0], t->high[0], v->i), share(t->low[1], t->high[1], v->j), &axes);
+        for (int a = 0; a < 3; a++) {
+            placed[k].normal[a] = (float)axes.up[a];
+            s->tangent[a] = (float)axes.along[a];
+        }
+        s->tangent[3] = (float)m->turn;
+    }
+}
+
+/* Slopes in metres are no slopes where coordinates are none. */
+static tl_status check_metres(const tl_mesh *mesh, const out_frame *frame, const char *path, tl_error *error)
+{
+    const tl_crs *crs = mesh->georef.crs;
+    tl_frame kind = out_frame_kind(frame);
+    if (kind == TL_FRAME_ENU || (kind == TL_FRAME_PROJECTED && !(crs && tl_crs_is_geographic(crs))))
+        return TL_OK;
+    return tl_fail(error, TL_ERROR_ARGUMENT,
+                   "%s: a normal texture is for coordinates in metres, as of the frames enu and ecef; leave it away",
+                   path);
+}
+
+static tl_status open_texture(const tl_mesh *mesh, out_frame *frame, model *m, const tl_write_options *options,
+                              const char *path, tl_error *error)
+{
+    if (!options->ground || options->texture_size < 0)
+        return tl_fail(error, TL_ERROR_ARGUMENT, "%s: textures need the ground that they show, and a size above 0",
+                       path);
+    tl_status status = TL_OK;
+    if (m->textures & TL_TEXTURE_NORMAL)
+        status = check_metres(mesh, frame, path, error);
+    if (status == TL_OK)
+        status = out_texture_open(mesh, options->ground, options->texture_size, &m->texture, error);
+    if (status == TL_OK && m->textures & TL_TEXTURE_NORMAL)
+        status = find_all_axes(mesh, frame, m, error);
+    return status;
+}
+
+/* The pictures, as parts of the binary chunk behind all others. */
+static tl_status add_images(model *m, const char *path, const tl_run *run, tl_error *error)
+{
+    static const char *const layers[] = {"albedo", "tangent"}; /* by tl_texture's bits */
+    tl_status status = TL_OK;
+    m->image_view = m->view_count;
+    for (int k = 0; k < 2 && status == TL_OK; k++) {
+        if (!(m->textures >> k & 1))
+            continue;
+        uint64_t bytes;
+        tl_output *file = out_texture_paint(&m->texture, layers[k], path, run, &bytes, error);
+        if (!file)
+            return TL_ERROR_IO;
+        m->views[m->view_count++] = (view){.file = file, .size = (size_t)bytes, .count = (size_t)bytes, .stride = 1};
+    }
+    return status;
 }
 
 static tl_status build(const tl_mesh *mesh, out_frame *frame, model *m, bool morphs, const char *path, tl_error *error)
@@ -199,7 +378,8 @@ static tl_status build(const tl_mesh *mesh, out_frame *frame, model *m, bool mor
     m->vertices = tl_alloc(m->vertex_count, sizeof *m->vertices);
     m->indices = tl_alloc(m->index_count, sizeof *m->indices);
     m->morphs = morphs ? tl_alloc(m->vertex_count, sizeof *m->morphs) : NULL;
-    if (!placed || !m->vertices || !m->indices || (morphs && !m->morphs)) {
+    m->skins = m->textures ? tl_alloc(m->vertex_count, sizeof *m->skins) : NULL;
+    if (!placed || !m->vertices || !m->indices || (morphs && !m->morphs) || (m->textures && !m->skins)) {
         free(placed);
         return tl_fail_memory(error, path);
     }
@@ -214,8 +394,10 @@ static tl_status build(const tl_mesh *mesh, out_frame *frame, model *m, bool mor
     vertex *ordered = m->vertices;
     m->vertices = placed;
     tl_status status = place_vertices(mesh, frame, m, error);
-    if (status == TL_OK)
+    if (status == TL_OK && !m->axes_at)
         add_normals(m);
+    if (status == TL_OK && m->textures)
+        place_skins(mesh, placed, m);
     if (status == TL_OK && morphs)
         status = place_morphs(mesh, frame, placed, m, error);
     m->vertices = ordered;
@@ -245,6 +427,7 @@ static bool small_indices(const model *m)
 static bool add_indices(model *m)
 {
     bool small = small_indices(m);
+    m->indices_view = m->view_count;
     view *v =
         add_view(m, m->index_count, small ? sizeof(uint16_t) : sizeof *m->indices, ELEMENT_ARRAY_BUFFER, "TRIANGLES");
     for (size_t k = 0; v && small && k < m->index_count; k++) {
@@ -318,8 +501,42 @@ static bool encode(view *v, size_t vertex_count)
     return v->size > 0;
 }
 
+/* Tangents, if there are any, and texture coordinates, in the coding's own numbers. */
+static bool add_skins(model *m)
+{
+    bool plain = m->coding == TL_CODING_PLAIN;
+    view *tangents = NULL, *places;
+    m->tangent_view = m->view_count;
+    if (m->axes_at)
+        tangents = add_view(m, m->vertex_count, plain ? 16 : 8, ARRAY_BUFFER, "ATTRIBUTES");
+    m->uv_view = m->view_count;
+    places = add_view(m, m->vertex_count, plain ? 8 : 4, ARRAY_BUFFER, "ATTRIBUTES");
+    if (!places || (m->axes_at && !tangents))
+        return false;
+    for (size_t k = 0; k < m->vertex_count; k++) {
+        const skin *s = &m->skins[k];
+        int16_t tangent[4];
+        uint16_t uv[2];
+        double t[3];
+        for (int a = 0; a < 2; a++)
+            uv[a] = (uint16_t)lrintf(s->uv[a] * STEPS);
+        for (int a = 0; a < 3; a++) /* a reader turns them by the node's scale */
+            t[a] = (double)s->tangent[a] / (plain ? 1 : m->step[a]);
+        scale_to_one(t);
+        for (int a = 0; a < 3; a++)
+            tangent[a] = (int16_t)lrint(32767 * t[a]);
+        tangent[3] = s->tangent[3] < 0 ? -32767 : 32767;
+        memcpy(places->bytes + k * places->stride, plain ? (const void *)s->uv : uv, places->stride);
+        if (tangents)
+            memcpy(tangents->bytes + k * tangents->stride, plain ? (const void *)s->tangent : tangent,
+                   tangents->stride);
+    }
+    return true;
+}
+
 static bool add_morphs(model *m)
 {
+    m->morph_view = m->view_count;
     view *v = add_view(m, m->vertex_count, sizeof *m->morphs, ARRAY_BUFFER, NULL);
     if (v)
         memcpy(v->bytes, m->morphs, v->size);
@@ -340,7 +557,7 @@ static tl_status make_views(model *m, const char *path, tl_error *error)
     }
     free(m->vertices); /* the largest of all, and done with */
     m->vertices = NULL;
-    good = good && (!m->morphs || add_morphs(m)) && add_indices(m);
+    good = good && (!m->skins || add_skins(m)) && (!m->morphs || add_morphs(m)) && add_indices(m);
     if (m->coding == TL_CODING_COMPRESSED) {
         meshopt_encodeVertexVersion(0); /* those of the extension */
         meshopt_encodeIndexVersion(1);
@@ -352,8 +569,14 @@ static tl_status make_views(model *m, const char *path, tl_error *error)
 
 static void free_model(model *m)
 {
-    for (int k = 0; k < m->view_count; k++)
+    for (int k = 0; k < m->view_count; k++) {
         free(m->views[k].bytes);
+        tl_output_abort(m->views[k].file);
+    }
+    if (m->texture.ground)
+        out_texture_close(&m->texture);
+    free(m->axes_at);
+    free(m->skins);
     free(m->vertices);
     free(m->morphs);
     free(m->indices);
@@ -424,6 +647,14 @@ static void add_range(const model *m, json_t *by)
     json_object_set_new(by, "max", triple(high));
 }
 
+/* An accessor whose whole numbers stand for -1 ... 1. */
+static json_t *normalized(const model *m, json_t *accessor)
+{
+    if (m->coding != TL_CODING_PLAIN)
+        json_object_set_new(accessor, "normalized", json_true());
+    return accessor;
+}
+
 static json_t *accessors(const model *m)
 {
     bool plain = m->coding == TL_CODING_PLAIN;
@@ -431,18 +662,22 @@ static json_t *accessors(const model *m)
     json_t *normal =
         accessor(plain ? 0 : 1, plain ? 12 : 0, plain ? COMPONENT_FLOAT : COMPONENT_I16, m->vertex_count, "VEC3");
     add_bounds(m, position);
-    if (!plain)
-        json_object_set_new(normal, "normalized", json_true());
+    normalized(m, normal);
     int component = small_indices(m) ? COMPONENT_U16 : COMPONENT_U32;
     json_t *list =
-        json_pack("[o,o,o]", position, normal, accessor(m->view_count - 1, 0, component, m->index_count, "SCALAR"));
+        json_pack("[o,o,o]", position, normal, accessor(m->indices_view, 0, component, m->index_count, "SCALAR"));
     if (m->morphs) {
-        int part = m->view_count - 2;
-        json_t *by = accessor(part, 0, COMPONENT_FLOAT, m->vertex_count, "VEC3");
+        json_t *by = accessor(m->morph_view, 0, COMPONENT_FLOAT, m->vertex_count, "VEC3");
         add_range(m, by);
         json_array_append_new(list, by);
-        json_array_append_new(list, accessor(part, 12, COMPONENT_FLOAT, m->vertex_count, "SCALAR"));
+        json_array_append_new(list, accessor(m->morph_view, 12, COMPONENT_FLOAT, m->vertex_count, "SCALAR"));
     }
+    if (m->axes_at)
+        json_array_append_new(list, normalized(m, accessor(m->tangent_view, 0, plain ? COMPONENT_FLOAT : COMPONENT_I16,
+                                                           m->vertex_count, "VEC4")));
+    if (m->skins)
+        json_array_append_new(list, normalized(m, accessor(m->uv_view, 0, plain ? COMPONENT_FLOAT : COMPONENT_U16,
+                                                           m->vertex_count, "VEC2")));
     return list;
 }
 
@@ -458,11 +693,12 @@ static json_t *buffer_views(const model *m, size_t *stored, size_t *decoded)
     *stored = *decoded = 0;
     for (int k = 0; k < m->view_count; k++) {
         const view *v = &m->views[k];
-        bool encoded = m->coding == TL_CODING_COMPRESSED, vertices = v->target == ARRAY_BUFFER;
+        bool encoded = m->coding == TL_CODING_COMPRESSED && v->mode, vertices = v->target == ARRAY_BUFFER;
         size_t bytes = v->count * v->stride;
-        json_t *item =
-            json_pack("{s:i,s:I,s:I,s:i}", "buffer", encoded ? 1 : 0, "byteOffset",
-                      (json_int_t)(encoded ? *decoded : *stored), "byteLength", (json_int_t)bytes, "target", v->target);
+        json_t *item = json_pack("{s:i,s:I,s:I}", "buffer", encoded ? 1 : 0, "byteOffset",
+                                 (json_int_t)(encoded ? *decoded : *stored), "byteLength", (json_int_t)bytes);
+        if (v->target)
+            json_object_set_new(item, "target", json_integer(v->target));
         if (vertices)
             json_object_set_new(item, "byteStride", json_integer((json_int_t)v->stride));
         if (encoded)
@@ -473,7 +709,7 @@ static json_t *buffer_views(const model *m, size_t *stored, size_t *decoded)
                                           v->mode));
         json_array_append_new(list, item);
         *stored += padded(v->size);
-        *decoded += padded(bytes);
+        *decoded += encoded ? padded(bytes) : 0;
     }
     return list;
 }
@@ -550,6 +786,35 @@ static void add_target(json_t *root)
     json_object_set_new(mesh, "extras", json_pack("{s:[s]}", "targetNames", "parent"));
 }
 
+/* Colours and normals of the material, and where vertices lie on them. */
+static void add_textures(const model *m, json_t *root)
+{
+    json_t *mesh = json_array_get(json_object_get(root, "meshes"), 0);
+    json_t *attributes = json_object_get(json_array_get(json_object_get(mesh, "primitives"), 0), "attributes");
+    json_t *material = json_array_get(json_object_get(root, "materials"), 0);
+    json_t *surface = json_object_get(material, "pbrMetallicRoughness");
+    json_t *images = json_array(), *textures = json_array();
+    int next = m->morphs ? 5 : 3, count = 0; /* accessors */
+    if (m->axes_at)
+        json_object_set_new(attributes, "TANGENT", json_integer(next++));
+    json_object_set_new(attributes, "TEXCOORD_0", json_integer(next));
+    if (m->textures & TL_TEXTURE_COLOUR) {
+        json_object_set_new(surface, "baseColorTexture", json_pack("{s:i}", "index", count++));
+        json_object_set_new(surface, "baseColorFactor", json_pack("[f,f,f,f]", 1.0, 1.0, 1.0, 1.0));
+    }
+    if (m->textures & TL_TEXTURE_NORMAL)
+        json_object_set_new(material, "normalTexture", json_pack("{s:i}", "index", count++));
+    for (int k = 0; k < count; k++) {
+        json_array_append_new(images, json_pack("{s:i,s:s}", "bufferView", m->image_view + k, "mimeType", "image/png"));
+        json_array_append_new(textures, json_pack("{s:i,s:i}", "sampler", 0, "source", k));
+    }
+    json_object_set_new(root, "images", images);
+    json_object_set_new(root, "textures", textures);
+    json_object_set_new(root, "samplers",
+                        json_pack("[{s:i,s:i,s:i,s:i}]", "magFilter", LINEAR, "minFilter", LINEAR_MIPMAP_LINEAR,
+                                  "wrapS", CLAMP_TO_EDGE, "wrapT", CLAMP_TO_EDGE));
+}
+
 static char *describe(const tl_mesh *mesh, const out_frame *frame, const model *m)
 {
     json_t *root = json_pack("{s:{s:s, s:s, s:o}, s:i, s:[{s:[i]}], s:[o], s:[{s:[{s:{s:i,s:i}, s:i, s:i, s:i}]}], "
@@ -563,6 +828,8 @@ static char *describe(const tl_mesh *mesh, const out_frame *frame, const model *
         add_geometry(m, root);
     if (root && m->morphs)
         add_target(root);
+    if (root && m->textures)
+        add_textures(m, root);
     char *text = root ? json_dumps(root, JSON_COMPACT | JSON_REAL_PRECISION(17)) : NULL;
     json_decref(root);
     return text;
@@ -581,6 +848,19 @@ static tl_status too_large(const char *path, size_t triangles, tl_error *error)
                    "%s: %zu triangles need more than the 4 GiB of a GLB; refine by fewer levels, cut it in parts, or "
                    "use .ply",
                    path, triangles);
+}
+
+static tl_status copy_file(const view *from, tl_output *output, tl_error *error)
+{
+    unsigned char piece[1 << 14];
+    tl_status status = TL_OK;
+    for (size_t at = 0; at < from->size && status == TL_OK; at += sizeof piece) {
+        size_t some = from->size - at < sizeof piece ? from->size - at : sizeof piece;
+        status = tl_output_read_at(from->file, piece, some, at, error);
+        if (status == TL_OK)
+            status = tl_output_append(output, piece, some, error);
+    }
+    return status == TL_OK ? tl_output_append(output, "\0\0\0", padded(from->size) - from->size, error) : status;
 }
 
 static tl_status write_file(const model *m, const char *json, tl_output *output, tl_error *error)
@@ -602,7 +882,8 @@ static tl_status write_file(const model *m, const char *json, tl_output *output,
     if (status == TL_OK)
         status = write_words(output, binary_head, 2, error);
     for (int k = 0; status == TL_OK && k < m->view_count; k++)
-        status = tl_output_append(output, m->views[k].bytes, padded(m->views[k].size), error);
+        status = m->views[k].file ? copy_file(&m->views[k], output, error)
+                                  : tl_output_append(output, m->views[k].bytes, padded(m->views[k].size), error);
     return status;
 }
 
@@ -627,12 +908,17 @@ tl_status out_gltf_write(const tl_mesh *mesh, tl_output *output, const tl_write_
         return status == TL_OK ? TL_ERROR_DATA : status;
     model m = {
         .coding = options->coding, .level_steps = out_frame_kind(frame) == TL_FRAME_PIXEL, .geocentric = geocentric};
+    m.textures = options->textures & (TL_TEXTURE_COLOUR | TL_TEXTURE_NORMAL);
     out_frame_tangent(frame, m.axes, m.centre);
     status = first_position(mesh, frame, m.origin, error);
+    if (status == TL_OK && m.textures)
+        status = open_texture(mesh, frame, &m, options, path, error);
     if (status == TL_OK)
         status = build(mesh, frame, &m, options->parent_heights, path, error);
     if (status == TL_OK)
         status = make_views(&m, path, error);
+    if (status == TL_OK && m.textures)
+        status = add_images(&m, path, options->run, error);
     char *json = status == TL_OK ? describe(mesh, frame, &m) : NULL;
     if (status == TL_OK)
         status = json ? write_file(&m, json, output, error) : tl_fail_memory(error, path);

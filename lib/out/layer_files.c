@@ -2,6 +2,7 @@
 #include "lib/base/error.h"
 #include "lib/base/georef.h"
 #include "lib/base/size.h"
+#include "lib/out/layer_paint.h"
 #include "lib/out/out.h"
 #include "lib/out/png_encoder.h"
 #include "lib/scene/layers.h"
@@ -97,13 +98,12 @@ static unsigned char byte_of(double value)
     return (unsigned char)(value > 1 ? 255 : value > 0 ? value * 255 + 0.5 : 0);
 }
 
-/* A sample's bytes: normals from -1 ... 1, slopes of 0 ... 90 degrees, shares as they are, colours as sRGB. */
-static void paint(const tl_layer_kind *kind, const float *values, size_t stride, unsigned char *out)
+void out_layer_paint(const tl_layer_kind *kind, const float *values, size_t stride, unsigned char out[4])
 {
     memset(out, 0, 4);
     if (isnan(values[0]))
         return;
-    bool shares = kind->channels == 4, colours = strcmp(kind->name, "colour") == 0;
+    bool shares = kind->channels == 4, colours = strcmp(kind->name, "colour") == 0 || strcmp(kind->name, "albedo") == 0;
     out[3] = 255;
     for (size_t c = 0; c < kind->channels; c++) {
         double v = (double)values[c * stride];
@@ -125,7 +125,7 @@ static tl_status paint_rows(void *context, int64_t y, int64_t count, unsigned ch
     tl_status status = values ? scene_layer_read(self->layer, (tl_window){0, y, self->width, count}, values, error)
                               : tl_fail_memory(error, "a layer's rows");
     for (size_t k = 0; status == TL_OK && k < samples; k++)
-        paint(kind, values + k, samples, rgba + 4 * k);
+        out_layer_paint(kind, values + k, samples, rgba + 4 * k);
     free(values);
     return status;
 }

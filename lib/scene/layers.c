@@ -109,6 +109,12 @@ static void make_colour(const scene_layer *layer, const spot *at, float *out)
     out[0] = c.r, out[1] = c.g, out[2] = c.b;
 }
 
+static void make_albedo(const scene_layer *layer, const spot *at, float *out)
+{
+    scene_rgb c = scene_palette_at(&layer->palette, (float)at->z);
+    out[0] = c.r, out[1] = c.g, out[2] = c.b;
+}
+
 static const tl_layer_kind kinds[] = {
     {"normal", "unit normals: east, north, up", 3, {"R", "G", "B"}},
     {"tangent", "unit normals in the picture's own axes: right, up, out of it", 3, {"R", "G", "B"}},
@@ -116,6 +122,7 @@ static const tl_layer_kind kinds[] = {
     {"curvature", "mean curvature in 1/m: above 0 in hollows, below 0 on ridges", 1, {"curvature"}},
     {"splat", "shares of rock, scree, soil and snow, by rules", 4, {"R", "G", "B", "A"}},
     {"colour", "colours by height, shaded, linear", 3, {"R", "G", "B"}},
+    {"albedo", "the same without light, for what is lit later", 3, {"R", "G", "B"}},
     {"sigma",
      "standard deviation of the detail's height difference over one sample, in metres (--support point)",
      1,
@@ -124,8 +131,8 @@ static const tl_layer_kind kinds[] = {
 };
 
 /* In the order of `kinds`. */
-static const maker makers[] = {make_normal, make_tangent, make_slope, make_curvature,
-                               make_splat,  make_colour,  make_sigma};
+static const maker makers[] = {make_normal, make_tangent, make_slope,  make_curvature,
+                               make_splat,  make_colour,  make_albedo, make_sigma};
 
 const tl_layer_kind *tl_layers(void)
 {
@@ -291,10 +298,9 @@ static void find_axes(scene_layer *layer)
 }
 
 /* Colours over the heights of some rows of the coarsest level that is the source's own samples. */
-static tl_status choose_colours(scene_layer *layer, tl_error *error)
+static tl_status choose_colours(scene_layer *layer, const tl_source *s, tl_error *error)
 {
     enum { ROWS = 512, MOST_WIDTH = 1 << 20 };
-    const tl_source *s = layer->heights;
     const tl_source *model = scene_field_dem(s) ? scene_field_dem(s) : s;
     int64_t width = tl_int64_min(model->info.width, MOST_WIDTH), rows = tl_int64_min(model->info.height, ROWS);
     float *sample = tl_alloc_grid(width, rows, sizeof *sample);
@@ -325,7 +331,8 @@ static tl_status find_sigma(scene_layer *layer, tl_error *error)
     return TL_OK;
 }
 
-static tl_status prepare(scene_layer *layer, const tl_layer_options *options, tl_error *error)
+static tl_status prepare(scene_layer *layer, const tl_layer_options *options, const tl_source *colours_of,
+                         tl_error *error)
 {
     find_axes(layer);
     scene_light_init(&layer->light, 315, 45);
@@ -337,20 +344,20 @@ static tl_status prepare(scene_layer *layer, const tl_layer_options *options, tl
     }
     if (status == TL_OK && layer->needs_sigma)
         status = find_sigma(layer, error);
-    if (status == TL_OK && layer->make == make_colour)
-        status = choose_colours(layer, error);
+    if (status == TL_OK && (layer->make == make_colour || layer->make == make_albedo))
+        status = choose_colours(layer, colours_of, error);
     return status;
 }
 
-scene_layer *scene_layer_create(const tl_source *heights, const char *kind, const tl_layer_options *options,
-                                tl_error *error)
+static scene_layer *create(const tl_source *heights, const char *kind, const tl_layer_options *options,
+                           const tl_source *colours_of, tl_error *error)
 {
     size_t k = 0;
     while (kinds[k].name && strcmp(kinds[k].name, kind) != 0)
         k++;
     if (!kinds[k].name) {
         tl_fail(error, TL_ERROR_ARGUMENT,
-                "no layer '%.60s'; use normal, tangent, slope, curvature, splat, colour or sigma", kind);
+                "no layer '%.60s'; use normal, tangent, slope, curvature, splat, colour, albedo or sigma", kind);
         return NULL;
     }
     scene_layer *layer = calloc(1, sizeof *layer);
@@ -361,10 +368,22 @@ scene_layer *scene_layer_create(const tl_source *heights, const char *kind, cons
     layer->kind = &kinds[k];
     layer->make = makers[k];
     layer->heights = heights;
-    if (prepare(layer, options, error) == TL_OK)
+    if (prepare(layer, options, colours_of, error) == TL_OK)
         return layer;
     scene_layer_destroy(layer);
     return NULL;
+}
+
+scene_layer *scene_layer_create(const tl_source *heights, const char *kind, const tl_layer_options *options,
+                                tl_error *error)
+{
+    return create(heights, kind, options, heights, error);
+}
+
+scene_layer *scene_layer_create_over(const tl_source *heights, const char *kind, const tl_source *colours_of,
+                                     tl_error *error)
+{
+    return create(heights, kind, NULL, colours_of, error);
 }
 
 void scene_layer_destroy(scene_layer *layer)

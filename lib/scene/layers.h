@@ -13,6 +13,9 @@ typedef struct scene_layer scene_layer;
 /* `kind`: a name of tl_layers(). Borrows `heights`. */
 scene_layer *scene_layer_create(const tl_source *heights, const char *kind, const tl_layer_options *options,
                                 tl_error *error);
+/* The same with default options; colours spread over the heights of `colours_of`. */
+scene_layer *scene_layer_create_over(const tl_source *heights, const char *kind, const tl_source *colours_of,
+                                     tl_error *error);
 void scene_layer_destroy(scene_layer *layer);
 const tl_layer_kind *scene_layer_kind(const scene_layer *layer);
 /* The window's values, channel by channel; NaN where the height is void. Any number of threads. */

@@ -1,0 +1,29 @@
+/* Pictures of the ground below a mesh, as textures: texels are samples of a level of a source. */
+#ifndef OUT_TEXTURE_H
+#define OUT_TEXTURE_H
+
+#include "lib/base/output.h"
+#include "lib/talus.h"
+
+enum { OUT_TEXTURE_SIZE = 4096 }; /* texels on a side, at most, unless told otherwise */
+
+typedef struct out_texture {
+    tl_source *ground;       /* heights at the texels */
+    const tl_source *whole;  /* whose range of heights the colours spread over */
+    double first[2], step;   /* column and row of the first texel's centre, and the way to the next, in samples */
+    int64_t low[2], high[2]; /* columns and rows of the mesh */
+} out_texture;
+
+/* The texels for the part of `surface` that the mesh covers: samples of its finest level that has at most `most` (0:
+ * OUT_TEXTURE_SIZE) a side. Borrows `surface`, over whose finest lattice the mesh lies. */
+tl_status out_texture_open(const tl_mesh *mesh, const tl_source *surface, int most, out_texture *out, tl_error *error);
+void out_texture_close(out_texture *texture);
+/* Texture coordinates of a sample: texel (p, q), whose centre is ((p + 1/2) / width, (q + 1/2) / height), lies on the
+ * sample that it was made from. Beyond the outermost texels' centres they stop. */
+void out_texture_place(const out_texture *texture, double i, double j, float uv[2]);
+/* A layer (lib/scene/layers.h) as a PNG, in a file that gets no name, which the caller aborts; NULL on failure. Voids
+ * take what is beside them. */
+tl_output *out_texture_paint(const out_texture *texture, const char *layer, const char *path, const tl_run *run,
+                             uint64_t *bytes, tl_error *error);
+
+#endif
