@@ -98,6 +98,7 @@ static int write_and_check(const settings *set, const tl_source *dem, tl_mesh *m
                                 .coding = (tl_mesh_coding)set->coding,
                                 .ground = dem,
                                 .texture_size = (int)set->common.texture_size,
+                                .split = (size_t)set->common.split,
                                 .run = run};
     command_textures(&set->common, &options.textures);
     if (add_below(set, mesh, &error) != TL_OK || tl_write_mesh(mesh, set->common.output, &options, &error) != TL_OK)
@@ -440,8 +441,10 @@ static bool settings_ok(settings *set)
                  "away");
     else if (set->coding != TL_CODING_PLAIN && !command_ends_with(set->common.output, ".glb"))
         complain("--coding is for .glb; other formats have but one");
-    else if (!command_textures(&set->common, &textures))
+    else if (!command_textures(&set->common, &textures) || !command_split_ok(&set->common))
         return false;
+    else if (set->common.split && (set->verify || set->coding != TL_CODING_PLAIN))
+        complain("--split goes without --verify, which reads one file back, and without --coding");
     else if (set->features && !set->max_error_given)
         complain("--features needs --max-error E, which tells what matters");
     else if (set->points && (set->skirt > 0 || set->base > 0))
@@ -500,7 +503,7 @@ static int run(const command *self, int argc, const char **argv, bool help)
          "coordinates of the mesh (default: enu where the CRS is known)", 0, 0, frame_names},
         {0}};
     const option input[] = {COMMON_INPUT(set.common), {0}};
-    const option output[] = {COMMON_OUTPUT(set.common), TEXTURE_OPTIONS(set.common), {0}};
+    const option output[] = {COMMON_OUTPUT(set.common), TEXTURE_OPTIONS(set.common), SPLIT_OPTION(set.common), {0}};
     const option running[] = {COMMON_RUNNING(set.common), {0}};
     const option_group groups[] = {
         {"Simplification", shape}, {"Input", input}, {"Output", output}, {"Running", running}, {0}};

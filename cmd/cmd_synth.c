@@ -80,6 +80,7 @@ static tl_status write_samples(const settings *set, const tl_source *made, const
     tl_mip usual = made->info.type == TL_RASTER_AREA ? TL_MIP_BOX : TL_MIP_LATTICE;
     tl_write_options options = {.overwrite = set->common.overwrite,
                                 .texture_size = (int)set->common.texture_size,
+                                .split = (size_t)set->common.split,
                                 .cog = set->cog,
                                 .lerc_error = set->lerc_error,
                                 .half_error = set->half ? set->quantum / 2 : 0,
@@ -260,7 +261,7 @@ static bool grid_output_ok(const settings *set)
     if (!layers_ok(set))
         return false;
     unsigned textures;
-    if (!command_textures(&set->common, &textures))
+    if (!command_textures(&set->common, &textures) || !command_split_ok(&set->common))
         return false;
     if (set->preset && (set->mip || set->compression || set->cog)) {
         complain("--preset decides how files are written; leave --mip, --compression and --cog away");
@@ -525,7 +526,7 @@ static void list_schemes(bool noise)
 
 /* What synth and noise write, and how. */
 #define GRID_OUTPUT(s)                                                                                                \
-    COMMON_OUTPUT((s).common), TEXTURE_OPTIONS((s).common),                                                           \
+    COMMON_OUTPUT((s).common), TEXTURE_OPTIONS((s).common), SPLIT_OPTION((s).common),                                 \
         {"compression",                                                                                               \
          0,                                                                                                           \
          OPTION_CHOICE,                                                                                               \

@@ -277,6 +277,14 @@ bool command_textures(const common *options, unsigned *out)
     return true;
 }
 
+bool command_split_ok(const common *options)
+{
+    bool good = !options->split || command_ends_with(options->output, ".glb");
+    if (!good)
+        complain("--split is for .glb; other formats have no limit of 4 GiB");
+    return good;
+}
+
 bool command_output_ok(const common *options, bool grid, bool mesh)
 {
     if (!options->output || !*options->output) {

@@ -36,7 +36,7 @@ typedef struct common {
     int64_t threads;
     int64_t memory;       /* MB; 0: DEFAULT_MEMORY */
     const char *textures; /* colour,normal; see command_textures */
-    int64_t texture_size;
+    int64_t texture_size, split;
     int progress; /* index into the names of progress_style */
 } common;
 
@@ -129,6 +129,12 @@ typedef struct common {
         "texture-size", 0, OPTION_INTEGER, &(c).texture_size, NULL, "N",                    \
             "texels on a side of these, at most, 1...16384 (default: 4096)", 1, 16384, NULL \
     }
+#define SPLIT_OPTION(c)                                                                                            \
+    {                                                                                                              \
+        "split", 0, OPTION_INTEGER, &(c).split, NULL, "N",                                                         \
+            "of a .glb: files NAME_x0_y0.glb and so on, of at most N triangles, 1000...2^31 (default: one)", 1000, \
+            2147483648, NULL                                                                                       \
+    }
 #define COMMON_RUNNING(c)                                                                                              \
     {"threads", 't', OPTION_INTEGER, &(c).threads, NULL, "N", "worker threads, 1...512 (default: one a processor)", 1, \
      512,       NULL},                                                                                                 \
@@ -195,6 +201,8 @@ __attribute__((format(printf, 2, 3))) void command_say(const common *options, co
 /* Flushes stdout; EXIT_DONE, or EXIT_FAILED with a message when it could not be written. */
 int command_done(void);
 /* Whether a name, or NULL, ends like this, in upper or lower case; one that is nothing but the ending does not. */
+/* Told and false where --split is given and the output is no .glb. */
+bool command_split_ok(const common *options);
 /* The tl_texture values of the option --texture, added; told and false where it names others or the output is no .glb.
  */
 bool command_textures(const common *options, unsigned *out);

@@ -763,7 +763,7 @@ typedef struct tl_lod_options {
     double bands[TL_LOD_BANDS];
     int max_level; /* finest level that may be used; 0: the field's own. Negative ones are coarser than the DEM */
     bool max_level_given;
-    unsigned keep;     /* an or of tl_culling: rules that are switched off */
+    unsigned keep; /* an or of tl_culling: rules that are switched off */
     /* Vertices come and go where the surface is, and move to their places as the eye comes nearer: no vertex
      * jumps. Takes the triangles of two thirds of the pixel error; not with bands. */
     bool morph;
@@ -1031,6 +1031,10 @@ typedef struct tl_write_options {
     const tl_source *ground;
     unsigned textures;
     int texture_size;
+    /* GLB, above 0: files NAME_x0_y0.glb and so on, tiles of the mesh from its first column and row, of at most so many
+     * triangles each. All are in one frame, and join, also by their normals; each has textures of its own. With plain
+     * coding and without heights of parents. */
+    size_t split;
     const tl_run *run;
 } tl_write_options;
 

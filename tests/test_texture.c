@@ -1,4 +1,4 @@
-/* Textures of GLBs: what lies where, decoded by hand and by libpng. */
+/* Textures and parts of GLBs: what lies where, decoded by hand and by libpng. */
 #include "dem/crs.h"
 #include "lib/base/georef.h"
 #include "lib/base/size.h"
@@ -71,15 +71,11 @@ static int tearDown(void **state)
     return 0;
 }
 
-static glb write_glb(const bench *b, tl_write_options options)
+static glb read_glb(const char *path)
 {
-    tl_error error;
     glb out = {0};
-    options.overwrite = true;
-    options.ground = b->source;
-    if (tl_write_mesh(b->mesh, b->path, &options, &error) != TL_OK)
-        fail_msg("%s", error.text);
-    FILE *f = fopen(b->path, "rb");
+    FILE *f = fopen(path, "rb");
+    assert_non_null(f);
     fseek(f, 0, SEEK_END);
     out.size = (size_t)ftell(f);
     rewind(f);
@@ -92,6 +88,16 @@ static glb write_glb(const bench *b, tl_write_options options)
     assert_non_null(out.json);
     out.binary = out.bytes + 28 + text;
     return out;
+}
+
+static glb write_glb(const bench *b, tl_write_options options)
+{
+    tl_error error;
+    options.overwrite = true;
+    options.ground = b->source;
+    if (tl_write_mesh(b->mesh, b->path, &options, &error) != TL_OK)
+        fail_msg("%s", error.text);
+    return read_glb(b->path);
 }
 
 static void close_glb(glb *g)
@@ -328,12 +334,83 @@ static void whatHasNoMetresHasNoNormals(void **state)
     assert_int_not_equal(access(b->path, F_OK), 0);
 }
 
+static size_t count_of(const glb *g, const char *name)
+{
+    json_t *primitive = json_array_get(json_object_get(item(g->json, "meshes", 0), "primitives"), 0);
+    json_int_t index =
+        strcmp(name, "indices") == 0 ? whole(primitive, name) : whole(json_object_get(primitive, "attributes"), name);
+    return (size_t)whole(item(g->json, "accessors", index), "count");
+}
+
+/* Place and normal of each sample's vertex, in glTF's coordinates; those that are known already must be the same. */
+static size_t gather(const bench *b, const glb *g, double (*known)[6])
+{
+    size_t count = count_of(g, "POSITION"), shared = 0;
+    for (size_t k = 0; k < count; k++) {
+        double at[6];
+        int i, j;
+        attribute(g, "POSITION", k, 3, at);
+        attribute(g, "NORMAL", k, 3, at + 3);
+        sample_of(b, g, k, &i, &j);
+        double *before = known[j * WIDTH + i];
+        if (!isnan(before[0])) {
+            assert_memory_equal(before, at, sizeof at);
+            shared++;
+        }
+        memcpy(before, at, sizeof at);
+    }
+    return shared;
+}
+
+/* Parts have the vertices of the whole, to the bit, and on their common rims all of them. */
+static void partsJoin(void **state)
+{
+    bench *b = *state;
+    enum { SPLIT = 500 };
+    double(*known)[6] = malloc(sizeof *known * WIDTH * HEIGHT);
+    for (int k = 0; k < WIDTH * HEIGHT; k++)
+        known[k][0] = NAN;
+    glb g = write_glb(b, (tl_write_options){0});
+    assert_int_equal(gather(b, &g, known), 0);
+    close_glb(&g);
+    unlink(b->path);
+    tl_error error;
+    const tl_write_options options = {.split = SPLIT};
+    assert_int_equal(tl_write_mesh(b->mesh, b->path, &options, &error), TL_OK);
+    assert_int_not_equal(access(b->path, F_OK), 0);
+    size_t triangles = 0, vertices = 0, files = 0;
+    for (int x = 0; x < 20; x++)
+        for (int y = 0; y < 20; y++) {
+            char path[96];
+            snprintf(path, sizeof path, "%.*s_x%d_y%d.glb", (int)strlen(b->path) - 4, b->path, x, y);
+            if (access(path, F_OK) != 0)
+                continue;
+            glb part = read_glb(path);
+            size_t count = count_of(&part, "indices") / 3;
+            assert_true(count > 0 && count <= SPLIT);
+            assert_int_equal(gather(b, &part, known), count_of(&part, "POSITION"));
+            triangles += count;
+            vertices += count_of(&part, "POSITION");
+            files++;
+            close_glb(&part);
+            unlink(path);
+        }
+    assert_int_equal(triangles, b->mesh->triangle_count);
+    assert_true(vertices > b->mesh->vertex_count);
+    assert_true(files >= triangles / SPLIT && files < 4 * triangles / SPLIT);
+    assert_int_equal(
+        tl_write_mesh(b->mesh, b->path, &(tl_write_options){.split = SPLIT, .coding = TL_CODING_QUANTIZED}, &error),
+        TL_ERROR_ARGUMENT);
+    free(known);
+}
+
 int main(void)
 {
     const struct CMUnitTest tests[] = {
         cmocka_unit_test_setup_teardown(texelsLieOnTheirSamples, setUp, tearDown),
         cmocka_unit_test_setup_teardown(normalsAreThoseOfTheGround, setUp, tearDown),
         cmocka_unit_test_setup_teardown(texturesKeepTheirSize, setUp, tearDown),
+        cmocka_unit_test_setup_teardown(partsJoin, setUp, tearDown),
         cmocka_unit_test_setup_teardown(whatHasNoMetresHasNoNormals, setUp, tearDown),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);

@@ -94,6 +94,8 @@ tl_status tl_write_mesh(const tl_mesh *mesh, const char *path, const tl_write_op
     if (!format->mesh)
         return tl_fail(error, TL_ERROR_ARGUMENT, "%s: .%s holds no meshes; use glb, obj, ply or stl", path,
                        format->ending);
+    if (options->split && format->mesh == out_gltf_write)
+        return out_gltf_write_parts(mesh, path, options, error);
     tl_output *output = tl_output_open(path, options->overwrite, error);
     if (!output)
         return TL_ERROR_IO;
@@ -110,16 +112,20 @@ static tl_status write_as_mesh(const tl_source *source, const char *path, const 
     tl_status fits = tl_run_fits(options->run, sample_bytes * samples, path, "the full mesh", error);
     if (fits != TL_OK && samples <= 0x1p31) /* more are no mesh, whatever the memory: told below */
         return fits;
-    tl_output *output = tl_output_open(path, options->overwrite, error); /* refused before the work, not after it */
-    if (!output)
+    const bool parts = options->split && write == out_gltf_write;
+    tl_output *output =
+        parts ? NULL : tl_output_open(path, options->overwrite, error); /* refused before the work, not after it */
+    if (!output && !parts)
         return TL_ERROR_IO;
     tl_mesh *mesh = NULL;
     tl_status status = tl_mesh_from_source(source, options->run, &mesh, error);
     tl_write_options writing = *options;
     writing.ground = source;
     if (status == TL_OK)
-        status = write(mesh, output, &writing, error);
+        status = parts ? out_gltf_write_parts(mesh, path, &writing, error) : write(mesh, output, &writing, error);
     tl_mesh_destroy(mesh);
+    if (parts)
+        return status;
     return finish(output, status, error);
 }
 

@@ -13,7 +13,9 @@
 #include <meshoptimizer.h>
 
 #include <math.h>
+#include <stdio.h>
 #include <string.h>
+#include <unistd.h>
 
 enum { BATCH = 1024, STEPS = 65535, GLB_MAGIC = 0x46546c67, CHUNK_JSON = 0x4e4f534a, CHUNK_BINARY = 0x004e4942 };
 enum {
@@ -370,7 +372,36 @@ static tl_status add_images(model *m, const char *path, const tl_run *run, tl_er
     return status;
 }
 
-static tl_status build(const tl_mesh *mesh, out_frame *frame, model *m, bool morphs, const char *path, tl_error *error)
+/* Vertices that are placed already, of a part of a larger mesh. */
+static void take_vertices(const vertex *ready, model *m)
+{
+    memcpy(m->vertices, ready, m->vertex_count * sizeof *ready);
+    for (int a = 0; a < 3; a++) {
+        m->low[a] = INFINITY;
+        m->high[a] = -INFINITY;
+        for (size_t k = 0; k < m->vertex_count; k++) {
+            m->low[a] = fminf(m->low[a], ready[k].position[a]);
+            m->high[a] = fmaxf(m->high[a], ready[k].position[a]);
+        }
+    }
+}
+
+/* Triangles in the order of the vertex cache. The pixel frame has rows for y: its picture is mirrored, so its triangles
+ * are turned to face up. */
+static void order_triangles_for(const tl_mesh *mesh, const out_frame *frame, model *m)
+{
+    bool flip = !out_frame_faces_up(frame);
+    meshopt_optimizeVertexCache(m->indices, mesh->indices, m->index_count, m->vertex_count);
+    for (size_t t = 0; flip && t < m->index_count; t += 3) {
+        uint32_t swapped = m->indices[t + 1];
+        m->indices[t + 1] = m->indices[t + 2];
+        m->indices[t + 2] = swapped;
+    }
+}
+
+/* `ready`: the vertices, placed, with their normals; NULL: they are placed here. */
+static tl_status build(const tl_mesh *mesh, out_frame *frame, model *m, const vertex *ready, bool morphs,
+                       const char *path, tl_error *error)
 {
     m->vertex_count = mesh->vertex_count;
     m->index_count = 3 * mesh->triangle_count;
@@ -383,18 +414,15 @@ static tl_status build(const tl_mesh *mesh, out_frame *frame, model *m, bool mor
         free(placed);
         return tl_fail_memory(error, path);
     }
-    /* the pixel frame has rows for y: its picture is mirrored, so its triangles are turned to face up */
-    bool flip = !out_frame_faces_up(frame);
-    meshopt_optimizeVertexCache(m->indices, mesh->indices, m->index_count, m->vertex_count);
-    for (size_t t = 0; flip && t < m->index_count; t += 3) {
-        uint32_t swapped = m->indices[t + 1];
-        m->indices[t + 1] = m->indices[t + 2];
-        m->indices[t + 2] = swapped;
-    }
+    order_triangles_for(mesh, frame, m);
     vertex *ordered = m->vertices;
     m->vertices = placed;
-    tl_status status = place_vertices(mesh, frame, m, error);
-    if (status == TL_OK && !m->axes_at)
+    tl_status status = TL_OK;
+    if (ready)
+        take_vertices(ready, m);
+    else
+        status = place_vertices(mesh, frame, m, error);
+    if (status == TL_OK && !m->axes_at && !ready)
         add_normals(m);
     if (status == TL_OK && m->textures)
         place_skins(mesh, placed, m);
@@ -844,10 +872,11 @@ static tl_status write_words(tl_output *output, const uint32_t *words, size_t co
 
 static tl_status too_large(const char *path, size_t triangles, tl_error *error)
 {
-    return tl_fail(error, TL_ERROR_ARGUMENT,
-                   "%s: %zu triangles need more than the 4 GiB of a GLB; refine by fewer levels, cut it in parts, or "
-                   "use .ply",
-                   path, triangles);
+    return tl_fail(
+        error, TL_ERROR_ARGUMENT,
+        "%s: %zu triangles need more than the 4 GiB of a GLB; give --split N, for files of N triangles, or use "
+        ".ply",
+        path, triangles);
 }
 
 static tl_status copy_file(const view *from, tl_output *output, tl_error *error)
@@ -887,34 +916,17 @@ static tl_status write_file(const model *m, const char *json, tl_output *output,
     return status;
 }
 
-tl_status out_gltf_write(const tl_mesh *mesh, tl_output *output, const tl_write_options *options, tl_error *error)
+/* A mesh, or a part of one in whose frame it is placed: then its vertices are `ready`. */
+static tl_status write_model(const tl_mesh *mesh, out_frame *frame, const model *start, const vertex *ready,
+                             const tl_write_options *options, tl_output *output, tl_error *error)
 {
     const char *path = tl_output_path(output);
-    if (!mesh->triangle_count)
-        return tl_fail(error, TL_ERROR_DATA, "%s: there is no triangle to write, and glTF has no empty meshes", path);
-    double least =
-        options->coding == TL_CODING_PLAIN ? sizeof(vertex) : sizeof(packed); /* bytes a vertex, not encoded */
-    if (options->coding != TL_CODING_COMPRESSED &&
-        (double)mesh->vertex_count * least + (double)mesh->triangle_count * 6 > UINT32_MAX)
-        return too_large(path, mesh->triangle_count, error);
-    if (options->parent_heights && options->coding != TL_CODING_PLAIN)
-        return tl_fail(error, TL_ERROR_ARGUMENT, "%s: heights of parents are kept as floats; leave the coding away",
-                       path);
-    tl_status status = tl_run_check(options->run, error);
-    bool geocentric = options->frame == TL_FRAME_ECEF; /* floats hold a tangent plane's metres, not the Earth's */
-    tl_frame kind = geocentric ? TL_FRAME_ENU : options->frame;
-    out_frame *frame = status == TL_OK ? out_frame_create(mesh, kind, path, error) : NULL;
-    if (!frame)
-        return status == TL_OK ? TL_ERROR_DATA : status;
-    model m = {
-        .coding = options->coding, .level_steps = out_frame_kind(frame) == TL_FRAME_PIXEL, .geocentric = geocentric};
-    m.textures = options->textures & (TL_TEXTURE_COLOUR | TL_TEXTURE_NORMAL);
-    out_frame_tangent(frame, m.axes, m.centre);
-    status = first_position(mesh, frame, m.origin, error);
-    if (status == TL_OK && m.textures)
+    model m = *start;
+    tl_status status = TL_OK;
+    if (m.textures)
         status = open_texture(mesh, frame, &m, options, path, error);
     if (status == TL_OK)
-        status = build(mesh, frame, &m, options->parent_heights, path, error);
+        status = build(mesh, frame, &m, ready, options->parent_heights, path, error);
     if (status == TL_OK)
         status = make_views(&m, path, error);
     if (status == TL_OK && m.textures)
@@ -924,6 +936,267 @@ tl_status out_gltf_write(const tl_mesh *mesh, tl_output *output, const tl_write_
         status = json ? write_file(&m, json, output, error) : tl_fail_memory(error, path);
     free(json);
     free_model(&m);
+    return status;
+}
+
+/* The frame of a mesh, and what all models in it have in common. */
+static tl_status begin(const tl_mesh *mesh, const char *path, const tl_write_options *options, out_frame **frame,
+                       model *start, tl_error *error)
+{
+    if (!mesh->triangle_count)
+        return tl_fail(error, TL_ERROR_DATA, "%s: there is no triangle to write, and glTF has no empty meshes", path);
+    if (options->parent_heights && options->coding != TL_CODING_PLAIN)
+        return tl_fail(error, TL_ERROR_ARGUMENT, "%s: heights of parents are kept as floats; leave the coding away",
+                       path);
+    tl_status status = tl_run_check(options->run, error);
+    bool geocentric = options->frame == TL_FRAME_ECEF; /* floats hold a tangent plane's metres, not the Earth's */
+    tl_frame kind = geocentric ? TL_FRAME_ENU : options->frame;
+    *frame = status == TL_OK ? out_frame_create(mesh, kind, path, error) : NULL;
+    if (!*frame)
+        return status == TL_OK ? TL_ERROR_DATA : status;
+    *start = (model){
+        .coding = options->coding, .level_steps = out_frame_kind(*frame) == TL_FRAME_PIXEL, .geocentric = geocentric};
+    start->textures = options->textures & (TL_TEXTURE_COLOUR | TL_TEXTURE_NORMAL);
+    out_frame_tangent(*frame, start->axes, start->centre);
+    return first_position(mesh, *frame, start->origin, error);
+}
+
+tl_status out_gltf_write(const tl_mesh *mesh, tl_output *output, const tl_write_options *options, tl_error *error)
+{
+    const char *path = tl_output_path(output);
+    double least =
+        options->coding == TL_CODING_PLAIN ? sizeof(vertex) : sizeof(packed); /* bytes a vertex, not encoded */
+    if (options->coding != TL_CODING_COMPRESSED &&
+        (double)mesh->vertex_count * least + (double)mesh->triangle_count * 6 > UINT32_MAX)
+        return too_large(path, mesh->triangle_count, error);
+    model start;
+    out_frame *frame = NULL;
+    tl_status status = begin(mesh, path, options, &frame, &start, error);
+    if (status == TL_OK)
+        status = write_model(mesh, frame, &start, NULL, options, output, error);
     out_frame_destroy(frame);
+    return status;
+}
+
+/* ---- Parts ---- */
+
+typedef struct parts {
+    const tl_mesh *mesh;
+    int64_t across; /* tiles each way */
+    int64_t low[2], size[2];
+    uint32_t *order;   /* triangles, tile by tile */
+    size_t *first;     /* in `order`, of each tile; across^2 + 1 */
+    uint32_t *numbers; /* of the mesh's vertices in the part in hand; UINT32_MAX: not there */
+    vertex *placed;    /* all vertices, with their normals */
+    tl_mesh part;      /* in hand, with room for the largest */
+    vertex *ready;
+} parts;
+
+/* The tile of a triangle, by its centroid: three times the sums, so that all is whole. */
+static size_t tile_of(const parts *p, size_t triangle)
+{
+    const uint32_t *corner = p->mesh->indices + 3 * triangle;
+    int64_t at[2] = {0, 0};
+    for (int k = 0; k < 3; k++) {
+        at[0] += p->mesh->vertices[corner[k]].i - p->low[0];
+        at[1] += p->mesh->vertices[corner[k]].j - p->low[1];
+    }
+    for (int a = 0; a < 2; a++)
+        at[a] = tl_int64_min(at[a] * p->across / (3 * p->size[a]), p->across - 1);
+    return (size_t)(at[1] * p->across + at[0]);
+}
+
+/* Triangles of each tile go to first[tile + 1]; the most of one. */
+static size_t count_triangles(parts *p)
+{
+    size_t tiles = (size_t)(p->across * p->across), most = 0;
+    memset(p->first, 0, (tiles + 1) * sizeof *p->first);
+    for (size_t t = 0; t < p->mesh->triangle_count; t++)
+        p->first[tile_of(p, t) + 1]++;
+    for (size_t k = 1; k <= tiles; k++)
+        most = p->first[k] > most ? p->first[k] : most;
+    return most;
+}
+
+/* As few tiles as hold at most `split` triangles each. */
+static tl_status choose_tiles(parts *p, size_t split, size_t *most, const char *path, tl_error *error)
+{
+    enum { MOST_ACROSS = 1024 };
+    for (p->across = 1; p->across <= MOST_ACROSS;) {
+        free(p->first);
+        p->first = tl_alloc((size_t)(p->across * p->across) + 1, sizeof *p->first);
+        if (!p->first)
+            return tl_fail_memory(error, path);
+        *most = count_triangles(p);
+        if (*most <= split)
+            return TL_OK;
+        double more = sqrt((double)*most / (double)split);
+        p->across = tl_int64_max(p->across + 1, (int64_t)((double)p->across * fmin(more, 4)));
+    }
+    return tl_fail(error, TL_ERROR_ARGUMENT,
+                   "%s: parts of %zu triangles would be more than a million; take larger ones", path, split);
+}
+
+static tl_status order_triangles(parts *p, const char *path, tl_error *error)
+{
+    size_t tiles = (size_t)(p->across * p->across);
+    size_t *next = tl_alloc(tiles, sizeof *next);
+    p->order = tl_alloc(p->mesh->triangle_count, sizeof *p->order);
+    if (!next || !p->order) {
+        free(next);
+        return tl_fail_memory(error, path);
+    }
+    for (size_t k = 0; k < tiles; k++) {
+        p->first[k + 1] += p->first[k];
+        next[k] = p->first[k];
+    }
+    for (size_t t = 0; t < p->mesh->triangle_count; t++)
+        p->order[next[tile_of(p, t)]++] = (uint32_t)t;
+    free(next);
+    return TL_OK;
+}
+
+/* All vertices in the frame of the whole, with normals by all triangles: so the parts join. */
+static tl_status place_all(parts *p, out_frame *frame, const model *start, const char *path, tl_error *error)
+{
+    model m = *start;
+    m.vertex_count = p->mesh->vertex_count;
+    m.index_count = 3 * p->mesh->triangle_count;
+    m.vertices = p->placed;
+    m.indices = tl_alloc(m.index_count, sizeof *m.indices);
+    if (!m.indices)
+        return tl_fail_memory(error, path);
+    order_triangles_for(p->mesh, frame, &m); /* sums of normals depend on it */
+    tl_status status = place_vertices(p->mesh, frame, &m, error);
+    if (status == TL_OK)
+        add_normals(&m);
+    free(m.indices);
+    return status;
+}
+
+static void take_part(parts *p, size_t tile)
+{
+    tl_mesh *part = &p->part;
+    part->vertex_count = 0;
+    part->triangle_count = p->first[tile + 1] - p->first[tile];
+    for (size_t t = 0; t < part->triangle_count; t++)
+        for (size_t k = 0; k < 3; k++) {
+            uint32_t from = p->mesh->indices[3 * (size_t)p->order[p->first[tile] + t] + k];
+            if (p->numbers[from] == UINT32_MAX) {
+                p->numbers[from] = (uint32_t)part->vertex_count;
+                part->vertices[part->vertex_count] = p->mesh->vertices[from];
+                p->ready[part->vertex_count++] = p->placed[from];
+            }
+            part->indices[3 * t + k] = p->numbers[from];
+        }
+    for (size_t t = 0; t < part->triangle_count; t++)
+        for (size_t k = 0; k < 3; k++)
+            p->numbers[p->mesh->indices[3 * (size_t)p->order[p->first[tile] + t] + k]] = UINT32_MAX;
+}
+
+/* "mesh.glb" to "mesh_x2_y0.glb"; to be freed. */
+static char *part_path(const parts *p, const char *path, size_t tile)
+{
+    size_t stem = (size_t)(strrchr(path, '.') - path), room = strlen(path) + 32, across = (size_t)p->across;
+    char *out = malloc(room);
+    if (out)
+        snprintf(out, room, "%.*s_x%zu_y%zu%s", (int)stem, path, tile % across, tile / across, path + stem);
+    return out;
+}
+
+static tl_status write_part(parts *p, size_t tile, out_frame *frame, const model *start, const char *path,
+                            const tl_write_options *options, tl_error *error)
+{
+    char *name = part_path(p, path, tile);
+    if (!name)
+        return tl_fail_memory(error, path);
+    tl_output *output = tl_output_open(name, options->overwrite, error);
+    tl_status status = output ? TL_OK : TL_ERROR_IO;
+    if (status == TL_OK) {
+        take_part(p, tile);
+        status = write_model(&p->part, frame, start, p->ready, options, output, error);
+    }
+    if (status == TL_OK)
+        status = tl_output_commit(output, error);
+    else
+        tl_output_abort(output);
+    free(name);
+    return status;
+}
+
+/* After a failure: parts that replaced nothing go. */
+static void remove_parts(const parts *p, size_t count, const char *path, const tl_write_options *options)
+{
+    for (size_t tile = 0; tile < count && !options->overwrite; tile++) {
+        char *name = p->first[tile + 1] > p->first[tile] ? part_path(p, path, tile) : NULL;
+        if (name)
+            unlink(name);
+        free(name);
+    }
+}
+
+static tl_status make_room(parts *p, size_t most, const char *path, tl_error *error)
+{
+    size_t vertices = p->mesh->vertex_count < 3 * most ? p->mesh->vertex_count : 3 * most;
+    p->part = *p->mesh;
+    p->part.vertices = tl_alloc(vertices, sizeof *p->part.vertices);
+    p->part.indices = tl_alloc(3 * most, sizeof *p->part.indices);
+    p->ready = tl_alloc(vertices, sizeof *p->ready);
+    p->placed = tl_alloc(p->mesh->vertex_count, sizeof *p->placed);
+    p->numbers = tl_alloc(p->mesh->vertex_count, sizeof *p->numbers);
+    if (!p->part.vertices || !p->part.indices || !p->ready || !p->placed || !p->numbers)
+        return tl_fail_memory(error, path);
+    memset(p->numbers, 0xff, p->mesh->vertex_count * sizeof *p->numbers);
+    return TL_OK;
+}
+
+static void find_size(parts *p)
+{
+    int64_t high[2] = {INT64_MIN, INT64_MIN};
+    p->low[0] = p->low[1] = INT64_MAX;
+    for (size_t k = 0; k < p->mesh->vertex_count; k++) {
+        const int64_t at[2] = {p->mesh->vertices[k].i, p->mesh->vertices[k].j};
+        for (int a = 0; a < 2; a++) {
+            p->low[a] = tl_int64_min(p->low[a], at[a]);
+            high[a] = tl_int64_max(high[a], at[a]);
+        }
+    }
+    for (int a = 0; a < 2; a++)
+        p->size[a] = tl_int64_max(high[a] - p->low[a], 1);
+}
+
+tl_status out_gltf_write_parts(const tl_mesh *mesh, const char *path, const tl_write_options *options, tl_error *error)
+{
+    if (options->coding != TL_CODING_PLAIN || options->parent_heights)
+        return tl_fail(error, TL_ERROR_ARGUMENT,
+                       "%s: parts have floats, so that they join, and no heights of parents; leave these away", path);
+    model start;
+    out_frame *frame = NULL;
+    parts p = {.mesh = mesh};
+    size_t most = 0;
+    tl_status status = begin(mesh, path, options, &frame, &start, error);
+    find_size(&p);
+    if (status == TL_OK)
+        status = choose_tiles(&p, options->split, &most, path, error);
+    if (status == TL_OK)
+        status = order_triangles(&p, path, error);
+    if (status == TL_OK)
+        status = make_room(&p, most, path, error);
+    if (status == TL_OK)
+        status = place_all(&p, frame, &start, path, error);
+    size_t tile = 0, tiles = (size_t)(p.across * p.across);
+    for (; status == TL_OK && tile < tiles; tile++)
+        if (p.first[tile + 1] > p.first[tile])
+            status = write_part(&p, tile, frame, &start, path, options, error);
+    if (status != TL_OK && tile)
+        remove_parts(&p, tile - 1, path, options);
+    out_frame_destroy(frame);
+    free(p.first);
+    free(p.order);
+    free(p.numbers);
+    free(p.placed);
+    free(p.ready);
+    free(p.part.vertices);
+    free(p.part.indices);
     return status;
 }

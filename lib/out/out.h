@@ -22,6 +22,8 @@ tl_status out_geotiff_write_bands(const tl_source *const *bands, size_t count, t
 /* The item talus_NAME of the record in a GeoTIFF, cut at `limit` bytes; false where there is none. */
 bool out_geotiff_item(const char *path, const char *name, char *text, size_t limit);
 tl_status out_gltf_write(const tl_mesh *mesh, tl_output *output, const tl_write_options *options, tl_error *error);
+/* As files NAME_x0_y0.glb and so on, of at most options->split triangles, which join. */
+tl_status out_gltf_write_parts(const tl_mesh *mesh, const char *path, const tl_write_options *options, tl_error *error);
 tl_status out_obj_write(const tl_mesh *mesh, tl_output *output, const tl_write_options *options, tl_error *error);
 tl_status out_ply_write(const tl_mesh *mesh, tl_output *output, const tl_write_options *options, tl_error *error);
 tl_status out_stl_write(const tl_mesh *mesh, tl_output *output, const tl_write_options *options, tl_error *error);
