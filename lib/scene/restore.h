@@ -7,9 +7,9 @@
 
 /* In a half step at spacing S a centre lies in the middle of a square of side S, an edge point in the middle of one of
  * the sides. Sites are counted in S / 4 from it: first those of the lattice before, then finer ones that a framework
- * may keep while it drops the vertex itself, all within 1.15 S. Triangles that conform have none nearer than 0.79 S,
+ * may keep while it drops the vertex itself, within 1.42 S. Triangles that conform have none nearer than 0.79 S,
  * but for those that split beside voids. */
-enum { SCENE_COARSE = 24, SCENE_FINE = 20, SCENE_SITES = SCENE_COARSE + SCENE_FINE };
+enum { SCENE_COARSE = 24, SCENE_FINE = 24, SCENE_SITES = SCENE_COARSE + SCENE_FINE };
 
 typedef enum scene_half { SCENE_CENTRES = 0, SCENE_EDGES } scene_half;
 
@@ -24,6 +24,10 @@ typedef struct scene_kriging {
     /* Of the residuals at a new vertex, its four nearest new neighbours and the four next: a filter over independent
      * noise that gives residuals the correlation that they have where all coarse sites are known; unit variance. */
     double taps[2][3];
+    /* Of square cells, all coarse sites known and no others: the table of the `stationary` scheme, which is nearer to
+     * fBm than kriging and a filter of two neighbours are for exponents below 0.3. */
+    bool tabulated;
+    scene_weights table[2];
 } scene_kriging;
 
 /* For cells `aspect` times as wide as high. */

@@ -1,13 +1,14 @@
 #include "lib/scene/restore.h"
 
 #include "fbm/elementary.h"
+#include "fbm/weights.h"
 
 #include <math.h>
 #include <string.h>
 
 /* One site of each orbit in a centre's picture; the others by the symmetries of the square. An edge's picture is this
  * one turned by 45 degrees and smaller by sqrt(2). */
-static const int32_t orbits[][2] = {{2, 2}, {6, 2}, {6, 6}, {10, 2}, {2, 0}, {4, 0}, {4, 2}, {3, 3}};
+static const int32_t orbits[][2] = {{2, 2}, {6, 2}, {6, 6}, {10, 2}, {2, 0}, {4, 0}, {4, 2}, {3, 3}, {4, 4}};
 
 static void add_orbit(int32_t (*to)[2], int *count, int32_t a, int32_t b)
 {
@@ -69,8 +70,14 @@ static void solve(double (*a)[SCENE_SITES + 2], int n)
     }
 }
 
+static const uint64_t all_coarse = (UINT64_C(1) << SCENE_COARSE) - 1;
+
 void scene_kriging_solve(const scene_kriging *self, scene_half half, uint64_t known, scene_weights *out)
 {
+    if (known == all_coarse && self->tabulated) {
+        *out = self->table[half];
+        return;
+    }
     int at[SCENE_SITES], n = 0;
     double a[SCENE_SITES + 1][SCENE_SITES + 2];
     for (int i = 0; i < SCENE_SITES; i++)
@@ -126,9 +133,27 @@ static void find_taps(double near, double next, double taps[3])
     taps[0] = t0 * norm, taps[1] = t1 * norm, taps[2] = t2 * norm;
 }
 
+/* Weights, deviation and filter of a half step by the table, whose noise is for the spacing S = 4. */
+static void tabulate(scene_kriging *self, scene_half half, double hurst)
+{
+    static const int orbit_of[] = {0, 1, 3, 4}; /* among a centre's weights, the sites' orbits in their order */
+    double values[FBM_WEIGHT_VALUES], *taps = self->taps[half];
+    scene_weights *out = &self->table[half];
+    fbm_values_table(hurst, values);
+    *out = (scene_weights){.sigma = 0};
+    for (int i = 0; i < SCENE_COARSE; i++)
+        out->weights[i] = values[orbit_of[i < 4 ? 0 : i < 12 ? 1 : i < 16 ? 2 : 3]];
+    const double t[3] = {values[6], values[7], values[9]}; /* edges have the same ones, at 2^(-1/2) of the spacing */
+    double norm = sqrt(t[0] * t[0] + 4 * t[1] * t[1] + 4 * t[2] * t[2]);
+    out->sigma = norm * fbm_exp2((half == SCENE_CENTRES ? 2 : 1.5) * hurst);
+    for (int k = 0; k < 3; k++)
+        taps[k] = t[k] / norm;
+}
+
 void scene_kriging_init(scene_kriging *self, double hurst, double aspect)
 {
     place_sites(self);
+    self->tabulated = false;
     for (int half = 0; half < 2; half++) {
         int32_t(*sites)[2] = self->sites[half];
         for (int i = 0; i < SCENE_SITES; i++) {
@@ -137,8 +162,12 @@ void scene_kriging_init(scene_kriging *self, double hurst, double aspect)
                 self->between[half][i][j] =
                     half_square(sites[i][0] - sites[j][0], sites[i][1] - sites[j][1], hurst, aspect);
         }
+        if (aspect == 1) {
+            tabulate(self, (scene_half)half, hurst);
+            continue;
+        }
         scene_weights w;
-        scene_kriging_solve(self, (scene_half)half, (UINT64_C(1) << SCENE_COARSE) - 1, &w);
+        scene_kriging_solve(self, (scene_half)half, all_coarse, &w);
         double c[3] = {0};
         for (int k = 0; k < 4; k++) {
             static const int32_t axes[4][2] = {{4, 0}, {0, 4}, {-4, 0}, {0, -4}},
@@ -154,4 +183,5 @@ void scene_kriging_init(scene_kriging *self, double hurst, double aspect)
         c[0] = residual_covariance(self, (scene_half)half, &w, 0, 0, hurst, aspect);
         find_taps(c[0] > 0 ? c[1] / c[0] : 0, c[0] > 0 ? c[2] / c[0] : 0, self->taps[half]);
     }
+    self->tabulated = aspect == 1;
 }
