@@ -3,6 +3,7 @@
 #include "lib/base/georef.h"
 #include "lib/base/size.h"
 #include "lib/scene/field_map.h"
+#include "lib/scene/patch.h"
 
 #include <math.h>
 #include <setjmp.h>
@@ -537,6 +538,68 @@ static void measuredMapsMakeAField(void **state)
     rmdir(folder);
 }
 
+/* ---- Beyond the rim ---------------------------------------------------------------------------- */
+
+typedef struct halves {
+    float delta[2], hurst[2]; /* west and east of the model's middle */
+} halves;
+
+static tl_status halves_read(const void *context, fbm_window window, float *delta, float *hurst, tl_error *error)
+{
+    (void)error;
+    const halves *h = context;
+    for (size_t k = 0; k < window.width * window.height; k++) {
+        int east = window.i + (int64_t)(k % window.width) >= WIDTH / 2;
+        delta[k] = h->delta[east];
+        hurst[k] = h->hurst[east];
+    }
+    return TL_OK;
+}
+
+static scene_patch read_patch(const tl_source *dem, const halves *by, double delta, double hurst, fbm_window window)
+{
+    scene_patch out;
+    tl_error error;
+    scene_growth growth = {.rings = 10, .trend = .5F, .delta = delta, .hurst = hurst, .aspect = 1, .seed = 5};
+    if (by) {
+        growth.by_place = halves_read;
+        growth.context = by;
+    }
+    assert_int_equal(scene_patch_read(dem, growth, window, &out, &error), TL_OK);
+    return out;
+}
+
+/* Each half, far from the other, is as if there were but its own strength and exponent: a multiple of 1/64 is taken as
+ * it is. Of another exponent the best guess is linear between two, which misses it by 1e-3 of the heights' range. */
+static void surroundingsFollowTheMaps(void **state)
+{
+    (void)state;
+    static const halves cases[] = {{{3, 0}, {.75F, .25F}}, {{.5F, 7}, {.5F, .5F}}, {{2, 2}, {.7F, .3F}}};
+    const fbm_window window = {-8, -8, WIDTH + 16, HEIGHT + 16, WIDTH + 16};
+    raster ground;
+    raster_make(&ground, ground_at, TL_RASTER_POINT, 1, "ground");
+    for (size_t c = 0; c < 3; c++) {
+        scene_patch both = read_patch(ground.source, &cases[c], 1, .6, window);
+        for (int east = 0; east < 2; east++) {
+            halves same = {{cases[c].delta[east], cases[c].delta[east]}, {cases[c].hurst[east], cases[c].hurst[east]}};
+            scene_patch alone = read_patch(ground.source, &same, 1, .6, window);
+            scene_patch plain =
+                read_patch(ground.source, NULL, fmax((double)same.delta[0], 1e-30), (double)same.hurst[0], window);
+            for (size_t k = 0; k < window.width * window.height; k++) {
+                int64_t i = window.i + (int64_t)(k % window.width);
+                double most = c < 2 ? (double)fabsf(plain.heights[k]) * 0x1p-22 : .1;
+                assert_true(fabs((double)alone.heights[k] - (double)plain.heights[k]) <= most);
+                if (east ? i > WIDTH / 2 + 20 : i < WIDTH / 2 - 20) /* two cells a turn of 20 */
+                    assert_true(alone.heights[k] == both.heights[k]);
+            }
+            scene_patch_free(&alone);
+            scene_patch_free(&plain);
+        }
+        scene_patch_free(&both);
+    }
+    tl_source_destroy(ground.source);
+}
+
 int main(void)
 {
     const struct CMUnitTest tests[] = {
@@ -554,6 +617,7 @@ int main(void)
         cmocka_unit_test(halvesHaveTheirOwnStatistics),
         cmocka_unit_test(sigmaMapsMeanTheirDelta),
         cmocka_unit_test(measuredMapsMakeAField),
+        cmocka_unit_test(surroundingsFollowTheMaps),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }

@@ -114,6 +114,16 @@ static tl_status read_maps(const field *f, fbm_window window, scene_planes *out,
     return status;
 }
 
+/* What fBm is made with beyond the rim and in voids: what the maps say there, or at their own rims. */
+static tl_status read_growth(const void *context, fbm_window window, float *delta, float *hurst, tl_error *error)
+{
+    const field *f = context;
+    scene_planes planes = {window, {[SCENE_STRENGTH] = delta, [SCENE_HURST] = f->chain.placed ? hurst : NULL}};
+    for (size_t k = 0; !f->chain.placed && k < window.width * window.height; k++)
+        hurst[k] = 0;
+    return read_maps(f, window, &planes, error);
+}
+
 static tl_status read_planes(const field *f, fbm_window window, ground *g, tl_error *error)
 {
     const char *name = f->dem->info.name;
@@ -134,6 +144,8 @@ static tl_status ground_read(const field *f, fbm_window window, ground *g, tl_er
     int rings = GROWTH + ROW_GROWTH * f->chain.shape.halvings;
     scene_growth growth = f->growth;
     growth.rings = rings;
+    growth.by_place = f->chain.mapped && !f->terrain ? read_growth : NULL;
+    growth.context = f;
     *g = (ground){.planes = {.of = {NULL}}};
     fbm_window wide = f->terrain ? scene_widened(window, FBM_ENERGY_MARGIN) : window;
     tl_status status = scene_patch_read(f->dem, growth, wide, &g->patch, error);
@@ -396,7 +408,6 @@ static tl_status open_maps(field *f, const tl_field_options *o, tl_error *error)
 {
     const tl_source_info *dem = &f->dem->info;
     scene_field_map *delta = &f->maps[SCENE_STRENGTH], *hurst = &f->maps[SCENE_HURST];
-    f->growth.delta = delta->fallback; /* of the model's surroundings */
     bool sigma = o->delta_map && o->delta_map_is_sigma;
     units_of(f, sigma);
     f->chain.mapped = true;
@@ -411,6 +422,7 @@ static tl_status open_maps(field *f, const tl_field_options *o, tl_error *error)
         f->hursts[l] = fmax(hurst->least, FBM_HURST_MIN);
         f->deltas[l] = fbm_exp2(-l * f->hursts[l]);
     }
+    f->growth.delta = 1; /* the maps' */
     return status == TL_OK && o->hurst_map ? scene_chain_fit_places(&f->chain, dem->name, error) : status;
 }
 

@@ -2,6 +2,7 @@
 
 #include "fbm/elementary.h"
 #include "fbm/rng.h"
+#include "fbm/weights.h"
 #include "lib/base/error.h"
 #include "lib/base/size.h"
 
@@ -188,17 +189,23 @@ static float grow_sample(scene_growth growth, const scene_patch *g, size_t x, si
 /* Rings that are simulated: the refinement of the outermost cells sees four. A cell's neighbours are those of 5 x 5. */
 enum { SIMULATED = 5, PARITIES = 4, NEAR = 2, ACROSS = 2 * NEAR + 1, NEIGHBOURS = ACROSS * ACROSS - 1, CACHED = 256 };
 
+/* Exponents by place, as numbers of steps; none: that of the growth. */
+enum { EXPONENT_STEPS = 64, NO_STEP = 0 };
+
 /* Weights of the neighbours that a mask names, in the order of its bits, and the standard deviation of what is left. */
 typedef struct guess {
     uint32_t mask;
+    int exponent;
     double weights[NEIGHBOURS], deviation;
 } guess;
 
 typedef struct simulation {
     const scene_growth *growth;
     int64_t around;                                    /* columns around the globe; 0: it does not wrap */
+    int exponent;                                      /* of the covariance */
     double covariance[2 * ACROSS - 1][2 * ACROSS - 1]; /* of offsets to 4 columns and rows */
     guess cache[CACHED];                               /* mask 0: empty */
+    float *delta, *hurst;                              /* by place; or NULL */
 } simulation;
 
 /* Step to neighbour n of 5 x 5. */
@@ -209,14 +216,40 @@ static void step_to(int n, int *dx, int *dy)
     *dy = n / ACROSS - NEAR;
 }
 
-static void simulation_start(simulation *s, const scene_growth *growth, const tl_source_info *dem)
+static void set_exponent(simulation *s, int exponent)
 {
-    *s = (simulation){.growth = growth, .around = dem->wraps ? dem->width : 0};
+    const double nearest = (double)exponent / EXPONENT_STEPS;
+    const double hurst = exponent == NO_STEP ? s->growth->hurst : fmin(fmax(nearest, FBM_HURST_MIN), FBM_HURST_MAX);
+    s->exponent = exponent;
     for (int dy = 0; dy < 2 * ACROSS - 1; dy++)
         for (int dx = 0; dx < 2 * ACROSS - 1; dx++) {
-            double x = dx - 2 * NEAR, y = dy - 2 * NEAR, a = growth->aspect;
-            s->covariance[dy][dx] = -.5 * fbm_pow(x * x * a + y * y / a, growth->hurst);
+            double x = dx - 2 * NEAR, y = dy - 2 * NEAR, a = s->growth->aspect;
+            s->covariance[dy][dx] = -.5 * fbm_pow(x * x * a + y * y / a, hurst);
         }
+}
+
+/* `g` is all that will be simulated. */
+static tl_status simulation_start(simulation *s, const scene_growth *growth, const scene_patch *g,
+                                  const tl_source_info *dem, tl_error *error)
+{
+    *s = (simulation){.growth = growth, .around = dem->wraps ? dem->width : 0};
+    set_exponent(s, NO_STEP);
+    if (!growth->by_place)
+        return TL_OK;
+    s->delta = tl_alloc_grid((int64_t)g->window.width, (int64_t)g->window.height, sizeof *s->delta);
+    s->hurst = tl_alloc_grid((int64_t)g->window.width, (int64_t)g->window.height, sizeof *s->hurst);
+    if (!s->delta || !s->hurst)
+        return tl_fail_memory(error, dem->name);
+    return growth->by_place(growth->context, g->window, s->delta, s->hurst, error);
+}
+
+static void simulation_free(simulation *s)
+{
+    if (s) {
+        free(s->delta);
+        free(s->hurst);
+    }
+    free(s);
 }
 
 static double covariance_of(const simulation *s, int dx, int dy)
@@ -260,7 +293,7 @@ static void make_guess(const simulation *s, uint32_t mask, guess *out)
     }
     /* the variance of ordinary kriging: minus the weighted covariances and the multiplier, for K(0) = 0 */
     double variance = -rows[n][n + 1] / rows[n][n];
-    *out = (guess){.mask = mask};
+    *out = (guess){.mask = mask, .exponent = s->exponent};
     for (int i = 0; i < n; i++) {
         out->weights[i] = rows[i][n + 1] / rows[i][i];
         variance -= out->weights[i] * right[i];
@@ -268,11 +301,14 @@ static void make_guess(const simulation *s, uint32_t mask, guess *out)
     out->deviation = variance > 0 ? sqrt(variance) : 0;
 }
 
-static const guess *find_guess(simulation *s, uint32_t mask)
+static const guess *find_guess(simulation *s, uint32_t mask, int exponent)
 {
-    guess *at = &s->cache[mask * 2654435761U >> 24];
-    if (at->mask != mask)
-        make_guess(s, mask, at);
+    guess *at = &s->cache[(mask ^ (uint32_t)exponent << 24) * 2654435761U >> 24];
+    if (at->mask == mask && at->exponent == exponent)
+        return at;
+    if (s->exponent != exponent)
+        set_exponent(s, exponent);
+    make_guess(s, mask, at);
     return at;
 }
 
@@ -286,7 +322,7 @@ static int64_t column_of(const simulation *s, const scene_patch *g, size_t k)
 static float simulate(simulation *s, const scene_patch *g, size_t k, int state)
 {
     size_t width = g->window.width, x = k % width, y = k / width;
-    double heights[NEIGHBOURS], sum = 0;
+    double heights[NEIGHBOURS], sum = 0, deviation = 0;
     uint32_t mask = 0;
     int count = 0;
     for (int n = 0; n < NEIGHBOURS; n++) {
@@ -300,12 +336,20 @@ static float simulate(simulation *s, const scene_patch *g, size_t k, int state)
     }
     if (!count)
         return NAN;
-    const guess *best = find_guess(s, mask);
-    for (int n = 0; n < count; n++)
-        sum += best->weights[n] * (heights[n] - heights[0]);
+    double at = s->hurst ? (double)s->hurst[k] * EXPONENT_STEPS : 0;
+    for (int side = 0; side < 2; side++) { /* the steps about the exponent; of none there is but one */
+        double step = floor(at) + side, share = 1 - fabs(at - step);
+        if (!(share > 0))
+            continue;
+        const guess *best = find_guess(s, mask, (int)step);
+        for (int n = 0; n < count; n++)
+            sum += share * (best->weights[n] * (heights[n] - heights[0]));
+        deviation += share * best->deviation;
+    }
+    double delta = s->delta ? (double)s->delta[k] : s->growth->delta;
     float noise;
     fbm_noise_row(s->growth->seed, 0, FBM_NOISE_VERTICES, g->window.j + (int64_t)y, column_of(s, g, k), 1, &noise);
-    return (float)(heights[0] + sum + s->growth->delta * best->deviation * (double)noise);
+    return (float)(heights[0] + sum + delta * deviation * (double)noise);
 }
 
 /* ---- Rings ------------------------------------------------------------------------------------- */
@@ -463,19 +507,19 @@ static tl_status read_known(const tl_source *dem, bool reflect, scene_patch *g, 
 
 static tl_status grow_patch(scene_growth growth, scene_patch *g, const tl_source_info *dem, tl_error *error)
 {
-    simulation *s = growth.delta > 0 ? malloc(sizeof *s) : NULL;
+    simulation *s = growth.delta > 0 ? calloc(1, sizeof *s) : NULL;
     size_t count = g->window.width * g->window.height;
     unsigned char *wanted = calloc(count, 1);
     uint32_t *samples = count <= UINT32_MAX ? tl_alloc(count, 2 * sizeof *samples) : NULL;
     bool good = wanted && samples && (s || !(growth.delta > 0));
     tl_status status = good ? TL_OK : tl_fail_memory(error, dem->name);
     if (good && s)
-        simulation_start(s, &growth, dem);
-    if (good)
+        status = simulation_start(s, &growth, g, dem, error);
+    if (status == TL_OK)
         grow(growth, s, g, wanted, (frontier[2]){{samples, 0}, {samples + count, 0}});
     free(wanted);
     free(samples);
-    free(s);
+    simulation_free(s);
     return status;
 }
 

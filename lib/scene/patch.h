@@ -25,14 +25,18 @@ typedef enum scene_known {
  *
  * Where `delta` is not 0, the first rings are simulated instead, so that the outermost cells are as those inside:
  * sample by sample, each the best guess of fBm from those before it within two cells, plus noise keyed by its place
- * with the variance of that guess. The order, ring by ring and by the parity of column and row within a ring, is that
- * of the lattice, not of the window. */
+ * with the variance of that guess; between exponents that are multiples of 1/64 it is linear. The order, ring by ring
+ * and by the parity of column and row within a ring, is that of the lattice, not of the window. */
 typedef struct scene_growth {
     int rings; /* at most 40 */
     float trend;
     bool reflect;
     double delta, hurst, aspect; /* of fBm over the geometric mean of a cell's sides; width over height of a cell */
     uint64_t seed;
+    /* NULL, or strengths and exponents at the samples of a window instead of delta, where that is not 0, and hurst; an
+     * exponent of 0 stands for that. */
+    tl_status (*by_place)(const void *context, fbm_window window, float *delta, float *hurst, tl_error *error);
+    const void *context;
 } scene_growth;
 
 /* Reads a patch; the result does not depend on where the window lies. Free with scene_patch_free. */
