@@ -196,6 +196,21 @@ static void set_channels(const writing *w, worker *self, tl_window window)
     }
 }
 
+/* One channel's rows are what the file holds already, on a machine whose bytes run as an EXR's: they need not be turned
+ * sample by sample, as OpenEXR does. Whole tiles change places with its buffer, which is from malloc as ours is. */
+static exr_result_t pack_rows(exr_encode_pipeline_t *pipeline)
+{
+    worker *self = pipeline->encoding_user_data;
+    if (pipeline->packed_alloc_size == OUT_TILE * OUT_TILE * sizeof(float) && !self->halves) {
+        void *theirs = pipeline->packed_buffer;
+        pipeline->packed_buffer = self->heights;
+        self->heights = theirs;
+    } else
+        memcpy(pipeline->packed_buffer, pipeline->channels[0].encode_from_ptr, pipeline->chunk.unpacked_size);
+    pipeline->packed_bytes = pipeline->chunk.unpacked_size;
+    return EXR_ERR_SUCCESS;
+}
+
 static exr_result_t encode(const writing *w, worker *self, tl_window window)
 {
     exr_chunk_info_t chunk;
@@ -212,6 +227,8 @@ static exr_result_t encode(const writing *w, worker *self, tl_window window)
     code = self->begun ? EXR_ERR_SUCCESS : exr_encoding_choose_default_routines(w->file, PART, pipeline);
     self->begun = true;
     pipeline->yield_until_ready_fn = await_turn;
+    if (w->planes->count == 1 && __BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__)
+        pipeline->convert_and_pack_fn = pack_rows;
     return code == EXR_ERR_SUCCESS ? exr_encoding_run(w->file, PART, pipeline) : code;
 }
 

@@ -32,15 +32,31 @@ out_extent out_extent_empty(void)
     return (out_extent){INFINITY, -INFINITY};
 }
 
+/* In lanes, so that no comparison waits for the one before: compilers make vectors of them, of this many at least. */
 void out_extent_add(out_extent *extent, const float *heights, size_t count)
 {
-    /* comparisons with NaN are false, so voids fall through */
-    float low = extent->low, high = extent->high;
-    for (size_t i = 0; i < count; i++) {
-        low = heights[i] < low ? heights[i] : low;
-        high = heights[i] > high ? heights[i] : high;
+    enum { LANES = 64 };
+    float low[LANES], high[LANES];
+    size_t i = 0;
+    for (int k = 0; k < LANES; k++) {
+        low[k] = extent->low;
+        high[k] = extent->high;
     }
-    *extent = (out_extent){low, high};
+    /* comparisons with NaN are false, so voids fall through */
+    for (; i + LANES <= count; i += LANES)
+        for (int k = 0; k < LANES; k++) {
+            float z = heights[i + (size_t)k];
+            low[k] = z < low[k] ? z : low[k];
+            high[k] = z > high[k] ? z : high[k];
+        }
+    for (; i < count; i++) {
+        low[0] = heights[i] < low[0] ? heights[i] : low[0];
+        high[0] = heights[i] > high[0] ? heights[i] : high[0];
+    }
+    for (int k = 0; k < LANES; k++) {
+        extent->low = low[k] < extent->low ? low[k] : extent->low;
+        extent->high = high[k] > extent->high ? high[k] : extent->high;
+    }
 }
 
 void out_extent_merge(out_extent *extent, const out_extent *other)

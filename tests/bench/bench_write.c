@@ -1,5 +1,5 @@
 /* Files of 4096 x 4096 floats on one thread and on two, beside plain writes of the same bytes; and GLBs of ten million
- * triangles. Heights lie in memory, so that only writing counts. bench_write [FOLDER] */
+ * triangles. Heights lie in memory, so that only writing counts. bench_write [FOLDER [FILE]] */
 #include "dem/crs.h"
 #include "lib/base/georef.h"
 #include "tests/bench/bench.h"
@@ -112,6 +112,20 @@ static void time_meshes(work *self, const tl_source_info *info)
     tl_source_destroy(source);
 }
 
+static const struct {
+    const char *name, *ending;
+    tl_write_options options;
+} files[] = {
+    {"exr none", "exr", {.compression = TL_COMPRESSION_NONE}},
+    {"exr zip", "exr", {.compression = TL_COMPRESSION_ZIP}},
+    {"exr piz", "exr", {.compression = TL_COMPRESSION_PIZ}},
+    {"tif none", "tif", {.compression = TL_COMPRESSION_NONE}},
+    {"tif deflate", "tif", {.compression = TL_COMPRESSION_DEFLATE}},
+    {"tif zstd", "tif", {.compression = TL_COMPRESSION_ZSTD}},
+    {"tif lerc 0.01", "tif", {.compression = TL_COMPRESSION_LERC, .lerc_error = 0.01}},
+    {"cog deflate", "tif", {.compression = TL_COMPRESSION_DEFLATE, .cog = true, .mip = TL_MIP_LATTICE}},
+};
+
 int main(int argc, char **argv)
 {
     work self = {.folder = argc > 1 ? argv[1] : "."};
@@ -137,18 +151,12 @@ int main(int argc, char **argv)
     printf("\nfile                 MB      1 t      2 t    gain    x plain writes\n%-14s %8.1f %8.3f\n", "plain writes",
            megabytes(self.path), self.raw);
     unlink(self.path);
-    time_grid(&self, "exr none", "exr", (tl_write_options){.compression = TL_COMPRESSION_NONE});
-    time_grid(&self, "exr zip", "exr", (tl_write_options){.compression = TL_COMPRESSION_ZIP});
-    time_grid(&self, "exr piz", "exr", (tl_write_options){.compression = TL_COMPRESSION_PIZ});
-    time_grid(&self, "tif none", "tif", (tl_write_options){.compression = TL_COMPRESSION_NONE});
-    time_grid(&self, "tif deflate", "tif", (tl_write_options){.compression = TL_COMPRESSION_DEFLATE});
-    time_grid(&self, "tif zstd", "tif", (tl_write_options){.compression = TL_COMPRESSION_ZSTD});
-    time_grid(&self, "tif lerc 0.01", "tif",
-              (tl_write_options){.compression = TL_COMPRESSION_LERC, .lerc_error = 0.01});
-    time_grid(&self, "cog deflate", "tif",
-              (tl_write_options){.compression = TL_COMPRESSION_DEFLATE, .cog = true, .mip = TL_MIP_LATTICE});
+    for (size_t k = 0; k < sizeof files / sizeof *files; k++)
+        if (argc < 3 || strcmp(argv[2], files[k].name) == 0)
+            time_grid(&self, files[k].name, files[k].ending, files[k].options);
     tl_source_destroy(source);
-    time_meshes(&self, &info);
+    if (argc < 3 || strcmp(argv[2], "glb") == 0)
+        time_meshes(&self, &info);
     tl_source_destroy(noise);
     tl_crs_release(crs);
     free(heights);
