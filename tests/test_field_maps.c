@@ -381,6 +381,41 @@ static void mapsWithoutAPlaceCoverTheModel(void **state)
     tl_source_destroy(map.source);
 }
 
+static float chequered(int i, int j)
+{
+    return (float)((i + j) % 2);
+}
+
+static float each_fourth(int i, int j)
+{
+    return i % 4 || j % 4 ? 0 : 1;
+}
+
+/* Of a map four times as fine the model's samples take the mean of 16 places an even distance apart, so a linear map is
+ * as it is, a chequered one grey, and what every fourth sample says counts no more than it covers. */
+static void finerMapsAreAveraged(void **state)
+{
+    (void)state;
+    static const number_at maps[] = {ramp_at, chequered, each_fourth};
+    for (int m = 0; m < 3; m++) {
+        raster map;
+        raster_make(&map, maps[m], TL_RASTER_POINT, 5, "map");
+        tl_source_info model = info_of(10, 8, TL_RASTER_POINT, 20, "model");
+        scene_field_map laid;
+        float all[8 * 10], part[3];
+        assert_int_equal(scene_field_map_open(map.source, &model, &zero_to_one, 0, NULL, &laid, NULL), TL_OK);
+        assert_int_equal(scene_field_map_read(&laid, (fbm_window){0, 0, 10, 8, 0}, all, NULL), TL_OK);
+        for (int j = 1; j < 7; j++)
+            for (int i = 1; i < 9; i++) {
+                double expected = m == 0 ? (double)ramp_at(4 * i, 4 * j) : m == 1 ? .5 : 1. / 16;
+                assert_true(fabs((double)all[10 * j + i] - expected) < 1e-6);
+            }
+        assert_int_equal(scene_field_map_read(&laid, (fbm_window){4, 2, 3, 1, 0}, part, NULL), TL_OK);
+        assert_memory_equal(part, all + 24, sizeof part);
+        tl_source_destroy(map.source);
+    }
+}
+
 /* Around a globe: column -1 is the last, and a map that goes around, too, has no seam. */
 static void mapsGoAroundWithTheModel(void **state)
 {
@@ -603,21 +638,14 @@ static void surroundingsFollowTheMaps(void **state)
 int main(void)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(mapsOfOneValueMakeTheSameField),
-        cmocka_unit_test(mapsOfOneValueFollowTheShapeOfCells),
-        cmocka_unit_test(exponentsAboveOneAreTheNearest),
-        cmocka_unit_test(voidsInMapsTakeTheModelsOwn),
-        cmocka_unit_test(windowsUnderMapsEqualTheWhole),
-        cmocka_unit_test(samplesAreKeptUnderMaps),
-        cmocka_unit_test(meansOfCellsAreKeptUnderMaps),
-        cmocka_unit_test(mapsAreLaidByPlace),
-        cmocka_unit_test(mapsWithoutAPlaceCoverTheModel),
-        cmocka_unit_test(mapsGoAroundWithTheModel),
-        cmocka_unit_test(wrongMapsAreTold),
-        cmocka_unit_test(halvesHaveTheirOwnStatistics),
-        cmocka_unit_test(sigmaMapsMeanTheirDelta),
-        cmocka_unit_test(measuredMapsMakeAField),
-        cmocka_unit_test(surroundingsFollowTheMaps),
+        cmocka_unit_test(mapsOfOneValueMakeTheSameField), cmocka_unit_test(mapsOfOneValueFollowTheShapeOfCells),
+        cmocka_unit_test(exponentsAboveOneAreTheNearest), cmocka_unit_test(voidsInMapsTakeTheModelsOwn),
+        cmocka_unit_test(windowsUnderMapsEqualTheWhole),  cmocka_unit_test(samplesAreKeptUnderMaps),
+        cmocka_unit_test(meansOfCellsAreKeptUnderMaps),   cmocka_unit_test(mapsAreLaidByPlace),
+        cmocka_unit_test(mapsWithoutAPlaceCoverTheModel), cmocka_unit_test(finerMapsAreAveraged),
+        cmocka_unit_test(mapsGoAroundWithTheModel),       cmocka_unit_test(wrongMapsAreTold),
+        cmocka_unit_test(halvesHaveTheirOwnStatistics),   cmocka_unit_test(sigmaMapsMeanTheirDelta),
+        cmocka_unit_test(measuredMapsMakeAField),         cmocka_unit_test(surroundingsFollowTheMaps),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }

@@ -78,10 +78,19 @@ static tl_status check_place(const tl_source_info *model, const tl_source_info *
     return tl_run_fits(run, bytes, map->name, "reading it, much finer than the model, as a map", error);
 }
 
+/* Places, no farther apart than the map's samples, in a step of the model that is so many of them. */
+static int places_about(double columns, double rows)
+{
+    double samples = fmax(fabs(columns), fabs(rows)) - 1e-6;
+    return samples > 1 ? (int)ceil(fmin(samples, 1 << 20)) : 1;
+}
+
 tl_status scene_field_map_open(const tl_source *map, const tl_source_info *model, const scene_field_map_rule *rule,
                                double fallback, const tl_run *run, scene_field_map *out, tl_error *error)
 {
     *out = (scene_field_map){.source = map,
+                             .across = 1,
+                             .down = 1,
                              .fallback = fallback,
                              .least = fallback,
                              .turn = model->wraps ? model->width : 0,
@@ -92,6 +101,8 @@ tl_status scene_field_map_open(const tl_source *map, const tl_source_info *model
     tl_status status = lay(model, &map->info, out->to, error);
     if (status == TL_OK)
         status = check_place(model, &map->info, out->to, run, error);
+    out->across = places_about(out->to[1], out->to[4]);
+    out->down = places_about(out->to[2], out->to[5]);
     tl_range range;
     tl_run quiet = run ? *run : (tl_run){0};
     quiet.progress = NULL;
@@ -139,10 +150,12 @@ static tl_status sheet_read(const scene_field_map *map, fbm_window window, sheet
     const tl_source_info *info = &map->source->info;
     double low[2] = {HUGE_VAL, HUGE_VAL}, high[2] = {-HUGE_VAL, -HUGE_VAL};
     const int64_t right = window.i + (int64_t)window.width - 1, below = window.j + (int64_t)window.height - 1;
+    const double beside = map->across > 1 ? .5 : 0, beyond = map->down > 1 ? .5 : 0; /* of cells */
     bool turned = map->turn && (window.i < 0 || right >= map->turn);
     for (int corner = 0; corner < 4; corner++) {
         double i = turned ? (corner & 1 ? (double)map->turn : 0) : (double)(corner & 1 ? right : window.i);
-        double j = (double)(corner & 2 ? below : window.j);
+        double j = corner & 2 ? (double)below + beyond : (double)window.j - beyond;
+        i += corner & 1 ? beside : -beside;
         for (int axis = 0; axis < 2; axis++) {
             double at = position(map->to + 3 * axis, i, j);
             low[axis] = fmin(low[axis], at);
@@ -186,6 +199,18 @@ static float number_at(const scene_field_map *map, const sheet *s, double u, dou
     return (float)(rows[0] + down * (rows[1] - rows[0]));
 }
 
+static float mean_at(const scene_field_map *map, const sheet *s, double i, double j)
+{
+    double sum = 0;
+    for (int y = 0; y < map->down; y++)
+        for (int x = 0; x < map->across; x++) {
+            double u = i + (2 * x + 1 - map->across) / (2.0 * map->across),
+                   v = j + (2 * y + 1 - map->down) / (2.0 * map->down);
+            sum += (double)number_at(map, s, position(map->to, u, v), position(map->to + 3, u, v));
+        }
+    return (float)(sum / ((double)map->across * map->down));
+}
+
 tl_status scene_field_map_read(const scene_field_map *map, fbm_window window, float *out, tl_error *error)
 {
     if (!map->source) {
@@ -198,7 +223,7 @@ tl_status scene_field_map_read(const scene_field_map *map, fbm_window window, fl
     for (size_t y = 0; status == TL_OK && y < window.height; y++)
         for (size_t x = 0; x < window.width; x++) {
             double i = column_of(map, window.i + (int64_t)x), j = (double)(window.j + (int64_t)y);
-            *out++ = number_at(map, &s, position(map->to, i, j), position(map->to + 3, i, j));
+            *out++ = mean_at(map, &s, i, j);
         }
     free(s.numbers);
     return status;
