@@ -235,13 +235,15 @@ static int fly_all(journey *j, const flight *path, progress *bar)
 {
     tl_error error;
     double first = 0, others = 0;
-    uint64_t triangles = 0;
+    uint64_t triangles = 0, under = 0;
     for (size_t k = 0; k < path->count; k++) {
         tl_lod_stats stats;
         tl_view_errors shift = {0};
         if (fly_frame(j, &path->views[k], k, &stats, &shift, &error) != TL_OK)
             return command_failed(bar, &error);
         tell_frame(j, k, &stats, &shift);
+        if (stats.above_ground < 0 && !under++)
+            lod_warn_of_ground(&j->set->common, &stats);
         *(k ? &others : &first) += stats.seconds;
         triangles += stats.triangles;
         if (j->run->progress)

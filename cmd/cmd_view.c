@@ -123,6 +123,7 @@ static int write_view(const settings *set, const lod_ground *ground, const tl_ru
         return command_failed(bar, &error);
     report(set, &stats, seconds);
     warn_of_nothing(set, &stats);
+    lod_warn_of_ground(&set->common, &stats);
     if (set->measure) {
         char text[VIEW_REPORT_TEXT];
         view_report_text(&measured, text, sizeof text);

@@ -128,6 +128,15 @@ void lod_ground_close(lod_ground *ground)
     *ground = (lod_ground){0};
 }
 
+void lod_warn_of_ground(const common *shared, const tl_lod_stats *stats)
+{
+    if (stats->above_ground < 0)
+        command_say(shared,
+                    "warning: the eye is %.3g m under the ground, which is seen from above only; give it a greater "
+                    "height, or --above-ground",
+                    -stats->above_ground);
+}
+
 static json_t *count(uint64_t value)
 {
     return json_integer((json_int_t)value);
@@ -137,11 +146,11 @@ json_t *lod_stats_json(const tl_lod_stats *s)
 {
     json_t *culled = json_pack("{s:o, s:o, s:o, s:o}", "frustum", count(s->culled[0]), "back", count(s->culled[1]),
                                "horizon", count(s->culled[2]), "ridge", count(s->culled[3]));
-    return json_pack("{s:o, s:o, s:o, s:o, s:o, s:o, s:o, s:o, s:o, s:o, s:o, s:i, s:o, s:f}", "triangles",
+    return json_pack("{s:o, s:o, s:o, s:o, s:o, s:o, s:o, s:o, s:o, s:o, s:o, s:i, s:o, s:o, s:f}", "triangles",
                      count(s->triangles), "vertices", count(s->vertices), "visited", count(s->visited), "split",
                      count(s->split), "merged", count(s->merged), "culled", culled, "tiles_made", count(s->tiles_made),
                      "tiles_used", count(s->tiles_used), "samples_made", count(s->samples_made), "dem_blocks",
                      count(s->dem_blocks), "dem_samples", count(s->dem_samples), "finest_level", s->finest_level,
-                     "pixel_error", isfinite(s->pixel_error) ? json_real(s->pixel_error) : json_null(), "seconds",
-                     s->seconds);
+                     "pixel_error", isfinite(s->pixel_error) ? json_real(s->pixel_error) : json_null(), "above_ground",
+                     isfinite(s->above_ground) ? json_real(s->above_ground) : json_null(), "seconds", s->seconds);
 }

@@ -152,6 +152,8 @@ tl_status lod_ground_open(const common *shared, lod_options *options, const argu
                           const char *output, const tl_run *run, lod_ground *out, tl_error *error);
 void lod_ground_close(lod_ground *ground);
 
+/* Tells of an eye that is under the ground. */
+void lod_warn_of_ground(const common *shared, const tl_lod_stats *stats);
 /* The statistics for machines; a new reference. */
 json_t *lod_stats_json(const tl_lod_stats *stats);
 

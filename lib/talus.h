@@ -780,6 +780,7 @@ typedef struct tl_lod_stats {
     uint64_t dem_blocks, dem_samples; /* blocks of the DEM that were read, and samples of windows of it */
     int finest_level;
     double pixel_error; /* the largest that is left, by the bounds used; infinite at distance 0 */
+    double above_ground; /* metres of the eye above the DEM; NaN where that has none */
     double seconds;
 } tl_lod_stats;
 

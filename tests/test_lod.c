@@ -579,7 +579,11 @@ static void expect_some_end(const world *w, const tl_view *view, tl_lod_options 
         tl_status status = tl_select(w->field, w->dem, w->pyramid, view, &options, &mesh, NULL, &error);
         if (status == TL_OK) {
             expect_no_cracks(mesh);
-            expect_sound(w, mesh);
+            if (!options.morph)
+                expect_sound(w, mesh);
+            for (size_t k = 0; k < mesh->vertex_count; k++)
+                assert_true(isfinite(mesh->vertices[k].z));
+            assert_true(!options.budget || mesh->triangle_count <= options.budget);
         } else
             assert_true(error.text[0]);
         tl_mesh_destroy(mesh);
@@ -632,6 +636,75 @@ static void smallRastersEndWell(void **state)
             }
             free_world(&w);
         }
+}
+
+/* Each extreme view over each extreme model, with options that are extreme, too. */
+static void extremeViewsOfExtremeModelsEndWell(void **state)
+{
+    (void)state;
+    const int sizes[][2] = {{1, 1}, {1, 9}, {9, 1}, {9, 9}, {17, 12}};
+    const int kinds[] = {VOIDS_NONE, VOIDS_CHECKERS, VOIDS_ALL, VOIDS_FEW};
+    const double heights[] = {-100, 0, 30, 1e9}, fovs[] = {.01, 60, 179};
+    const tl_lod_options options[] = {{.pixel_error = 1e-6},
+                                      {.pixel_error = 1e6},
+                                      {.budget = 2},
+                                      {.budget = UINT64_C(1) << 31},
+                                      {.pixel_error = 3, .morph = true},
+                                      {.budget = 300, .morph = true}};
+    for (int n = 0; n < 5 * 4; n++) {
+        world w = make_world(sizes[n / 4][0], sizes[n / 4][1], 1, kinds[n % 4], 10, 3);
+        for (int v = 0; v < 4 * 3; v++)
+            for (int o = 0; o < 6; o++) {
+                tl_view view = view_over(&w, 10, v % 2 ? -90 : -5, heights[v / 3]);
+                view.fov = fovs[v % 3];
+                expect_some_end(&w, &view, options[o]);
+            }
+        free_world(&w);
+    }
+}
+
+static void eyesUnderTheGroundAreTold(void **state)
+{
+    (void)state;
+    tl_error error;
+    for (int kind = VOIDS_NONE; kind < VOID_KINDS; kind += VOIDS_ALL) {
+        world w = make_world(33, 33, 2, kind, 10, 3);
+        tl_view view = view_over(&w, 10, -40, -200);
+        tl_lod_stats stats, flown;
+        tl_mesh_destroy(select_view(&w, &view, NULL, &stats));
+        tl_roam *roam = tl_roam_create(w.field, w.dem, w.pyramid, NULL, &error);
+        assert_int_equal(tl_roam_look(roam, &view, &flown, &error), TL_OK);
+        if (kind == VOIDS_NONE) {
+            assert_true(stats.above_ground < -100 && stats.above_ground > -310);
+            assert_true(fabs(flown.above_ground - stats.above_ground) < 1e-9);
+        } else
+            assert_true(isnan(stats.above_ground) && isnan(flown.above_ground));
+        tl_roam_destroy(roam);
+        free_world(&w);
+    }
+}
+
+/* Views that each fit the memory, in a flight that leaves more behind than fits. */
+static void flightsForgetWhatMemoryDoesNotHold(void **state)
+{
+    (void)state;
+    tl_error error;
+    world w = make_world(1025, 1025, 3, VOIDS_NONE, 10, 3);
+    tl_run run = {.memory = 26 << 20};
+    const tl_lod_options options = {.selector = TL_SELECTOR_ROAM, .pixel_error = 3, .run = &run};
+    tl_roam *roam = tl_roam_create(w.field, w.dem, w.pyramid, &options, &error);
+    assert_non_null(roam);
+    for (int frame = 0; frame < 8; frame++) {
+        tl_view view = view_over(&w, 45 * frame, -15, 150);
+        tl_mesh *kept = NULL, *fresh = select_view(&w, &view, &options, NULL);
+        if (tl_roam_look(roam, &view, NULL, &error) != TL_OK || tl_roam_mesh(roam, &kept, &error) != TL_OK)
+            fail_msg("%s", error.text);
+        expect_same_bytes(kept, fresh);
+        tl_mesh_destroy(kept);
+        tl_mesh_destroy(fresh);
+    }
+    tl_roam_destroy(roam);
+    free_world(&w);
 }
 
 static void memoryIsKept(void **state)
@@ -801,6 +874,9 @@ int main(void)
         cmocka_unit_test(bandsSetTheCells),
         cmocka_unit_test(extremeViewsEndWell),
         cmocka_unit_test(smallRastersEndWell),
+        cmocka_unit_test(extremeViewsOfExtremeModelsEndWell),
+        cmocka_unit_test(eyesUnderTheGroundAreTold),
+        cmocka_unit_test(flightsForgetWhatMemoryDoesNotHold),
         cmocka_unit_test(memoryIsKept),
         cmocka_unit_test(refusesWhatItCannotTake),
         cmocka_unit_test(threadsChangeNoByte),

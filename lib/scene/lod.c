@@ -143,7 +143,7 @@ void lod_turn(lod *l, const scene_view *view)
 {
     l->view = view;
     l->camera = scene_view_camera(view);
-    l->stats = (tl_lod_stats){0};
+    l->stats = (tl_lod_stats){.above_ground = scene_view_above_ground(view)};
     scene_tiles_count_again(l->tiles);
     lod_prepare_tests(l);
     lod_ridges_destroy(l->ridges);
@@ -329,6 +329,7 @@ static tl_status select_from(lod *l, const tl_view *view, tl_mesh **out, tl_erro
         return TL_ERROR_ARGUMENT;
     scene_view_know_ground(from, (double)l->low, false); /* lod_ridges.c knows where the voids are */
     tl_status status = TL_OK;
+    l->stats.above_ground = (double)NAN;
     if (l->empty)
         status = select_nothing(l, out, error);
     else {

@@ -776,6 +776,47 @@ static tl_status look_kept(tl_roam *r, const tl_view *view, tl_lod_stats *stats,
     return status;
 }
 
+enum { LISTS = 11 };
+static lod_list *list_of(tl_roam *r, size_t which)
+{
+    lod_list *const all[LISTS] = {&r->nodes, &r->free_nodes, &r->free_vertices, &r->holds, &r->places, &r->fresh,
+                                  &r->busy,  &r->stale,      &r->queue,         &r->next,  &r->leaves};
+    return all[which];
+}
+
+/* Forgets all that was looked at before. */
+static tl_status forget(tl_roam *r, tl_error *error)
+{
+    const lod *l = &r->l;
+    const tl_source *field = l->field, *dem = l->dem;
+    const tl_pyramid *pyramid = l->pyramid;
+    for (size_t k = 0; k < LISTS; k++) {
+        free(list_of(r, k)->items);
+        *list_of(r, k) = (lod_list){0};
+    }
+    lod_finish(&r->l);
+    r->seen_any = false;
+    return lod_init(&r->l, field, dem, pyramid, &r->options, error);
+}
+
+static tl_status look_from(tl_roam *r, const scene_view *from, tl_error *error)
+{
+    lod_turn(&r->l, from);
+    tl_status status = lod_ridges_create(&r->l, &r->l.ridges, error);
+    return status == TL_OK ? update(r, error) : status;
+}
+
+/* What earlier views have left, and this one does not need, may take the memory: then it starts from nothing. */
+static tl_status look_anyhow(tl_roam *r, const scene_view *from, tl_error *error)
+{
+    bool more = r->nodes.count > 0;
+    tl_status status = look_from(r, from, error);
+    if (status != TL_ERROR_MEMORY || !more)
+        return status;
+    status = forget(r, error);
+    return status == TL_OK ? look_from(r, from, error) : status;
+}
+
 tl_status tl_roam_look(tl_roam *r, const tl_view *view, tl_lod_stats *stats, tl_error *error)
 {
     double start = lod_now();
@@ -790,12 +831,9 @@ tl_status tl_roam_look(tl_roam *r, const tl_view *view, tl_lod_stats *stats, tl_
     scene_view_know_ground(from, (double)l->low, false); /* lod_ridges.c knows where the voids are */
     r->split = r->merged = 0;
     tl_status status = TL_OK;
-    if (!l->empty) {
-        lod_turn(l, from);
-        status = lod_ridges_create(l, &l->ridges, error);
-        if (status == TL_OK)
-            status = update(r, error);
-    }
+    l->stats.above_ground = (double)NAN;
+    if (!l->empty)
+        status = look_anyhow(r, from, error);
     double seconds = lod_now() - start;
     r->view = *view;
     r->seen_any = true;
@@ -889,10 +927,8 @@ void tl_roam_destroy(tl_roam *r)
 {
     if (!r)
         return;
-    lod_list *const lists[] = {&r->nodes, &r->free_nodes, &r->free_vertices, &r->holds, &r->places, &r->fresh,
-                               &r->busy,  &r->stale,      &r->queue,         &r->next,  &r->leaves};
-    for (size_t k = 0; k < sizeof lists / sizeof *lists; k++)
-        free(lists[k]->items);
+    for (size_t k = 0; k < LISTS; k++)
+        free(list_of(r, k)->items);
     lod_finish(&r->l);
     free(r);
 }

@@ -130,28 +130,32 @@ static void face_normal(const scene_stage *s, size_t triangle, double out[3])
     out[2] = s->facing * scaled[2] / (f * f);
 }
 
-/* One after the other, so that sums do not depend on threads. */
-static void add_normals(scene_stage *s)
+/* One after the other, so that sums do not depend on threads; and in doubles, so that what the order of the triangles
+ * changes is lost in the normals' rounding: selectors that find the same triangles give the same picture. */
+static tl_status add_normals(scene_stage *s, tl_error *error)
 {
-    for (size_t k = 0; k < s->mesh->vertex_count; k++)
-        s->normals[k][0] = s->normals[k][1] = s->normals[k][2] = 0;
+    double(*sums)[3] = calloc(s->mesh->vertex_count + 1, sizeof *sums);
+    if (!sums)
+        return tl_fail_memory(error, "the picture");
     for (size_t t = 0; t < s->mesh->triangle_count; t++) {
         double n[3];
         face_normal(s, t, n);
         if (!isfinite(n[0] + n[1] + n[2]))
             continue;
         for (size_t k = 0; k < 3; k++) {
-            float *sum = s->normals[s->mesh->indices[3 * t + k]];
+            double *sum = sums[s->mesh->indices[3 * t + k]];
             for (int a = 0; a < 3; a++)
-                sum[a] += (float)n[a];
+                sum[a] += n[a];
         }
     }
     for (size_t k = 0; k < s->mesh->vertex_count; k++) {
-        float *n = s->normals[k];
-        double length = sqrt((double)n[0] * (double)n[0] + (double)n[1] * (double)n[1] + (double)n[2] * (double)n[2]);
-        for (int a = 0; a < 3 && length > 0; a++)
-            n[a] = (float)((double)n[a] / length);
+        const double *n = sums[k];
+        double length = sqrt(dot(n, n));
+        for (int a = 0; a < 3; a++)
+            s->normals[k][a] = length > 0 ? (float)(n[a] / length) : 0;
     }
+    free(sums);
+    return TL_OK;
 }
 
 /* ---- bands ---- */
@@ -237,7 +241,7 @@ void scene_stage_draw(const scene_stage *s, int band, scene_canvas *canvas)
 static tl_status fill_stage(scene_stage *s, const scene_stage_options *o, tl_error *error)
 {
     size_t vertices = s->mesh->vertex_count, triangles = s->mesh->triangle_count;
-    double bytes = (double)vertices * (o->normals ? 36 : 24) + (double)triangles * sizeof *s->spans;
+    double bytes = (double)vertices * (o->normals ? 60 : 24) + (double)triangles * sizeof *s->spans;
     tl_status status = tl_run_fits(o->run, bytes, "the picture", "drawing its triangles", error);
     if (status != TL_OK)
         return status;
@@ -252,7 +256,7 @@ static tl_status fill_stage(scene_stage *s, const scene_stage_options *o, tl_err
     if (status == TL_OK)
         status = tl_parallel_for(&quiet, triangles / ITEM + 1, 0, find_spans, s, error);
     if (status == TL_OK && o->normals)
-        add_normals(s);
+        status = add_normals(s, error);
     return status;
 }
 

@@ -272,6 +272,14 @@ void scene_view_know_ground(scene_view *view, double lowest, bool has_holes)
     view->has_holes = has_holes;
 }
 
+double scene_view_above_ground(const scene_view *view)
+{
+    double i, j, ground = 0;
+    scene_places_sample(view->places, scene_places_origin(view->places), &i, &j);
+    bool known = scene_ground_height(view->dem, "eye", i, j, &ground, NULL) == TL_OK;
+    return known ? view->camera.eye[2] - ground : (double)NAN;
+}
+
 const scene_camera *scene_view_camera(const scene_view *view)
 {
     return &view->camera;

@@ -31,6 +31,10 @@ const scene_camera *scene_view_camera(const scene_view *view);
 void scene_view_place(const scene_view *view, size_t n, const double *i, const double *j, const float *z,
                       double (*xyz)[3]);
 
+/* Metres of the eye above the model's ground, between samples bilinear; NaN where there is none: a void, or beside the
+ * raster. */
+double scene_view_above_ground(const scene_view *view);
+
 /* A rectangle of the lattice with a range of heights. */
 typedef struct scene_extent {
     double i0, j0, i1, j1;

@@ -82,15 +82,6 @@ static void set_span(scene_skyline *s, const scene_view *view)
     }
 }
 
-static bool is_above_ground(const scene_view *view)
-{
-    if (view->has_holes)
-        return false;
-    double i, j, ground;
-    scene_places_sample(view->places, scene_places_origin(view->places), &i, &j);
-    return scene_ground_height(view->dem, "eye", i, j, &ground, NULL) == TL_OK && view->camera.eye[2] > ground;
-}
-
 scene_skyline *scene_skyline_create(const scene_view *view, tl_error *error)
 {
     scene_skyline *s = calloc(1, sizeof *s);
@@ -100,7 +91,7 @@ scene_skyline *scene_skyline_create(const scene_view *view, tl_error *error)
     }
     for (int k = 0; k < BUCKETS; k++)
         s->buckets[k].limit = (double)INFINITY;
-    s->sees = is_above_ground(view);
+    s->sees = !view->has_holes && scene_view_above_ground(view) > 0;
     s->eye = view->camera.eye[2];
     s->margin = 0.01 / view->camera.focal;
     set_span(s, view);
