@@ -24,6 +24,12 @@ bool picture_options_ok(picture_options *o)
         complain("--depth-map: a name that ends with .exr is wanted, not '%s'", o->look.depth);
         return false;
     }
+    if (o->look.colour && strcmp(o->look.colour, "hypsometric") == 0)
+        o->look.colour = NULL;
+    if (o->look.colour && o->look.grey) {
+        complain("--grey goes without --colour");
+        return false;
+    }
     if (o->azimuth_given && !o->elevation_given)
         o->look.sun_elevation = 45;
     if (o->elevation_given && !o->azimuth_given)

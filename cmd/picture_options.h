@@ -45,6 +45,16 @@ typedef struct picture_options {
          1,                                                                                                   \
          1e9,                                                                                                 \
          NULL},                                                                                               \
+        {"colour",                                                                                            \
+         0,                                                                                                   \
+         OPTION_TEXT,                                                                                         \
+         &(p).look.colour,                                                                                    \
+         NULL,                                                                                                \
+         "FILE",                                                                                              \
+         "a raster of red, green and blue in the DEM's CRS, or hypsometric: by height, the default",          \
+         0,                                                                                                   \
+         0,                                                                                                   \
+         NULL},                                                                                               \
         {"grey", 0, OPTION_FLAG, &(p).look.grey, NULL, NULL, "shade only, no colours by height", 0, 0, NULL}, \
     {                                                                                                         \
         "facets", 0, OPTION_FLAG, &(p).look.facets, NULL, NULL,                                               \

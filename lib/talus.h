@@ -817,6 +817,9 @@ typedef struct tl_view_picture_options {
     double haze;                       /* metres at which half of the light is lost in the air; 0: clear */
     double exaggeration;               /* factor on the mesh's heights, not on the eye's, 0 ... 1e6; 0: 1 */
     bool grey;                         /* no colours by height */
+    /* A raster in dem's CRS that is laid over the mesh: bands of red, green and blue bytes, or one of grey. Where it has
+     * none, and where this is NULL: colours by height. Far ground has the means of what a pixel covers. */
+    const char *colour;
     bool facets; /* light each triangle by itself; else by normals at its corners, means over the triangles
                     around weighted by their areas, so that no triangle shows */
     const char

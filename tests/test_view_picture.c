@@ -1,6 +1,7 @@
 /* Views that are refused, camera files, and pictures of meshes. */
 #include "dem/crs.h"
 #include "lib/base/georef.h"
+#include "lib/scene/mesh_colour.h"
 #include "lib/scene/mesh_picture.h"
 #include "lib/scene/view.h"
 #include "lib/talus.h"
@@ -491,6 +492,65 @@ static void lightFollowsTheSun(void **state)
     finish(dem);
 }
 
+/* A board of black and white texels, two in a cell of the model: near, each has its own colour; far, all have the mean
+ * of their light; beside it there is none. */
+static void coloursLieWhereTheirRasterDoes(void **state)
+{
+    (void)state;
+    enum { SIDE = 64 };
+    static float board[SIDE * SIDE];
+    char path[] = "/tmp/talus_test_XXXXXX";
+    char name[sizeof path + 4];
+    tl_error error = {0};
+    tl_source *dem = hills(true, false, 1);
+    close(mkstemp(path));
+    snprintf(name, sizeof name, "%s.tif", path);
+    for (int k = 0; k < SIDE * SIDE; k++)
+        board[k] = (k % SIDE + k / SIDE) & 1 ? 255 : 0;
+    tl_source_info info = {.width = SIDE, .height = SIDE, .type = TL_RASTER_AREA, .name = "board"};
+    info.georef = dem->info.georef;
+    const double cell = 1 / 1200.0; /* of the model; the first texel's rim is at its sample (4, 2) */
+    const double transform[6] = {11 + 4.25 * cell, cell / 2, 0, 36 - 2.25 * cell, 0, -cell / 2};
+    memcpy(info.georef.transform, transform, sizeof transform);
+    tl_source *source = tl_array_source_create(board, &info, &error);
+    if (tl_write_grid(source, name, NULL, &error) != TL_OK)
+        fail_msg("%s", error.text);
+    scene_colours *colours = scene_colours_open(name, dem, NULL, &error);
+    if (!colours)
+        fail_msg("%s", error.text);
+    scene_rgb c;
+    for (int y = 0; y < SIDE; y += 7)
+        for (int x = 0; x < SIDE; x += 5) {
+            assert_true(scene_colours_at(colours, 4.25 + x / 2., 2.25 + y / 2., 1, &c));
+            assert_true(fabsf(c.r - (float)((x + y) & 1)) < 1e-4F && c.r == c.g && c.g == c.b);
+        }
+    assert_true(scene_colours_at(colours, 20, 18, 4000, &c));
+    assert_true(fabsf(c.g - .5F) < .01F); /* a step of a byte there is 0.0073 */
+    assert_false(scene_colours_at(colours, 3.9, 18, 1, &c));
+    assert_false(scene_colours_at(colours, 20, 34.1, 1, &c));
+    scene_colours_destroy(colours);
+
+    tl_source *elsewhere = hills(false, false, 1);
+    assert_null(scene_colours_open(name, elsewhere, NULL, &error));
+    assert_non_null(strstr(error.text, "CRS"));
+    tl_mesh *mesh = mesh_of(dem);
+    tl_view v = over;
+    scene_picture plain = paint(dem, mesh, &v, 1, &(tl_view_picture_options){.grey = true}),
+                  draped = paint(dem, mesh, &v, 1, &(tl_view_picture_options){.grey = true, .colour = name});
+    int64_t bytes = plain.width * plain.height * 4, differ = 0;
+    for (int64_t k = 0; k < bytes; k++)
+        differ += plain.rgba[k] != draped.rgba[k];
+    assert_true(differ > bytes / 100 && differ < bytes);
+    scene_picture_finish(&plain);
+    scene_picture_finish(&draped);
+    tl_mesh_destroy(mesh);
+    unlink(name);
+    unlink(path);
+    finish(elsewhere);
+    tl_source_destroy(source);
+    finish(dem);
+}
+
 /* Two views: the mean of both, in linear light. */
 static void motionBlurIsTheMeanOfTheLight(void **state)
 {
@@ -768,6 +828,7 @@ int main(void)
         cmocka_unit_test(groundIsSeenFromAboveOnly),
         cmocka_unit_test(meshesHaveNoCracksOnTheScreen),
         cmocka_unit_test(lightFollowsTheSun),
+        cmocka_unit_test(coloursLieWhereTheirRasterDoes),
         cmocka_unit_test(motionBlurIsTheMeanOfTheLight),
         cmocka_unit_test(picturesAndDepthsAreWritten),
         cmocka_unit_test(measuredErrorsAreTheShiftOnTheScreen),

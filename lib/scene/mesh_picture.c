@@ -4,6 +4,7 @@
 #include "lib/base/parallel.h"
 #include "lib/base/size.h"
 #include "lib/scene/light.h"
+#include "lib/scene/mesh_colour.h"
 
 #include <math.h>
 #include <stdlib.h>
@@ -15,6 +16,7 @@ struct scene_painter {
     const tl_source *dem;
     scene_palette palette;
     scene_light light;
+    scene_colours *colours; /* NULL: by height */
 };
 
 /* ---- colours ---- */
@@ -85,11 +87,17 @@ scene_painter *scene_painter_create(const tl_source *dem, const tl_view_picture_
     free(heights);
     scene_light_init(&p->light, p->options.sun_azimuth, p->options.sun_elevation);
     scene_encode_prepare();
+    if (options->colour && !(p->colours = scene_colours_open(options->colour, dem, options->run, error))) {
+        free(p);
+        return NULL;
+    }
     return p;
 }
 
 void scene_painter_destroy(scene_painter *painter)
 {
+    if (painter)
+        scene_colours_destroy(painter->colours);
     free(painter);
 }
 
@@ -129,7 +137,10 @@ static scene_rgb light_of(const painting *p, const scene_hit *hit, double x, dou
         return sky((float)sine);
     scene_point point;
     scene_stage_point(p->stage, hit, x, y, painter->options.facets, &point);
-    scene_rgb colour = scene_palette_at(&painter->palette, (float)point.height);
+    scene_rgb colour;
+    double pixel = point.at[2] * length / p->camera->focal;
+    if (!painter->colours || !scene_colours_at(painter->colours, point.i, point.j, pixel, &colour))
+        colour = scene_palette_at(&painter->palette, (float)point.height);
     colour = scene_lit_normal(&painter->light, colour, point.normal, 1);
     if (painter->options.haze == 0)
         return colour;
