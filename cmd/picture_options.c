@@ -26,6 +26,10 @@ bool picture_options_ok(picture_options *o)
     }
     if (o->look.colour && strcmp(o->look.colour, "hypsometric") == 0)
         o->look.colour = NULL;
+    if (o->look.colour && o->picture && strcmp(o->look.colour, o->picture) == 0) {
+        complain("%s: is the picture's colours; name another --picture", o->picture);
+        return false;
+    }
     if (o->look.colour && o->look.grey) {
         complain("--grey goes without --colour");
         return false;

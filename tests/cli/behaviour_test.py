@@ -887,6 +887,41 @@ def vertices_tell_where_they_came_from(case):
     expect("--morph is for a .glb" in refused, refused)
 
 
+def flights_tell_how_far_ground_jumps(case):
+    """fly --measure has a column more; with --geomorph the ground jumps less; an eye under the ground is told, once."""
+    with open(case.path("path.json"), "w", encoding="utf-8") as file:
+        json.dump({"width": 240, "height": 160, "heading": 120, "pitch": -5,
+                   "views": [{"eye": [-84.25, 36.55, 900]}, {"eye": [-84.2499, 36.5499, 900]}]}, file)
+    largest = []
+    for more in ((), ("--geomorph",)):
+        rows = case.run("fly", EXAMPLE, "--path", "path.json", "--frames", 5, "-l", 4, "--measure", "--csv", "-q", *more).out.split()
+        expect(rows[0].endswith(",seconds,shift") and len(rows) == 6, f"{rows}")
+        largest.append(max(float(row.split(",")[-1]) for row in rows[1:]))
+    expect(0 < largest[1] < largest[0] / 2 and largest[1] < 1, f"{largest}")
+    with open(case.path("deep.json"), "w", encoding="utf-8") as file:
+        json.dump({"views": [{"eye": [-84.25, 36.55, -900]}, {"eye": [-84.2499, 36.5499, -900]}]}, file)
+    said = case.run("fly", EXAMPLE, "--path", "deep.json", "--frames", 3).err
+    expect(said.count("under the ground") == 1, said)
+    said = case.run("view", EXAMPLE, "--eye", "-84.25,36.55,-900", "-o", "v.glb").err
+    expect(said.count("under the ground") == 1, said)
+    said = case.run("view", EXAMPLE, "--eye", "-84.25,36.55,900", "--distance-bands", "9", "--geomorph", "-o", "w.glb", status=2).err
+    expect("--geomorph" in said, said)
+
+
+def pictures_take_colours_of_rasters(case):
+    """A raster (of heights here, cut to bytes) colours the ground; hypsometric is the default."""
+    view = ("view", EXAMPLE, "--eye", "-84.25,36.55,2000", "--pitch", -60, "-l", 1, "--viewport", "320x200", "-q")
+    case.run(*view, "--picture", "plain.png")
+    case.run(*view, "--picture", "draped.png", "--colour", EXAMPLE)
+    expect(open(case.path("plain.png"), "rb").read() != open(case.path("draped.png"), "rb").read(), "no colour came")
+    case.run(*view, "--picture", "same.png", "--colour", "hypsometric")
+    expect(open(case.path("plain.png"), "rb").read() == open(case.path("same.png"), "rb").read(), "colours by height differ")
+    said = case.run(*view, "--picture", "a.png", "--colour", EXAMPLE, "--grey", status=2).err
+    expect("--grey" in said, said)
+    said = case.run(*view, "--picture", "a.png", "--colour", "none.tif", status=1).err
+    expect("none.tif" in said and not os.path.exists(case.path("a.png")), said)
+
+
 def inputs_are_not_overwritten(case):
     """An output that is an input too, by whatever name, is refused even with --overwrite, and the input stays."""
     with open(EXAMPLE, "rb") as example, open(case.path("dem.tif"), "wb") as copy:
@@ -1105,6 +1140,7 @@ TESTS = [
     formats_hold_the_same_heights, outputs_are_read_back, sidecars_are_checked, outputs_are_made_again, png_within_half_a_step, point_samples_are_kept, point_samples_of_the_andes_are_kept,
     area_means_stay_on_their_footprint,
     glb_is_in_metres, frames_agree, simplify_keeps_its_word, diagonals_are_turned, codings_keep_the_bound, layers_are_written_beside, inputs_are_not_overwritten, layers_are_refused_before_the_work, vertices_tell_where_they_came_from,
+    flights_tell_how_far_ground_jumps, pictures_take_colours_of_rasters,
     manuals_show_what_works, man_page_knows_every_option,
     memory_does_not_grow_with_the_output, memory_stays_within_what_is_given, bad_files_end_with_one_line,
     gdal_reads_the_geotiff, gdal_places_the_example, openexr_reads_the_exr, openimageio_agrees_on_the_range,
