@@ -346,6 +346,23 @@ bool lod_behind_ridge(const lod *l, const lod_triangle *t, int depth)
     return behind_ridge(l, &at, depth);
 }
 
+/* Where blocks begin a triangle is also tried by the box around the heights that the pyramid knows there, which is
+ * smaller than a ball: what that hides is not read. */
+static bool stays_out(const lod *l, const subject *s, unsigned rules)
+{
+    scene_box box;
+    scene_extent extent = extent_of(l, s);
+    double more = lod_residual(l, NULL);
+    if (s->depth != lod_block_depth(l) || !(rules & TL_CULL_FRUSTUM))
+        return false;
+    lod_wide_range(l, s->at.x0 / l->cell, s->at.y0 / l->cell, tl_div_up(s->at.x1, l->cell),
+                   tl_div_up(s->at.y1, l->cell), &extent.low, &extent.high);
+    extent.low -= more;
+    extent.high += more;
+    scene_view_box(l->view, &extent, &box);
+    return scene_view_hides(l->view, &extent, &box, HUGE_VAL, TL_CULL_FRUSTUM) != 0;
+}
+
 static sight look_at(const lod *l, const subject *s, unsigned rules)
 {
     if (s->at.over || s->leg > LONGEST || l->degrees * (s->at.x1 - s->at.x0) / l->cell > WIDEST) {
@@ -371,9 +388,12 @@ static sight look_at(const lod *l, const subject *s, unsigned rules)
     bool tried = level_of(l, s->depth) <= 0 || s->depth % TRIED == 0;
     if (tried && rules & TL_CULL_FRUSTUM && beside(l, middle, radius, out.beside))
         out.hidden = TL_CULL_FRUSTUM;
-    else if (box)
+    else if (stays_out(l, s, rules)) {
+        out.hidden = TL_CULL_FRUSTUM;
+        out.margin = -1;
+    } else if (box)
         out.hidden = look_at_box(l, s, rules & ~(unsigned)TL_CULL_FRUSTUM).hidden;
-    if (box)
+    if (box || s->depth == lod_block_depth(l))
         out.margin = -1;
     if (!out.hidden && rules & TL_CULL_RIDGE && behind_ridge(l, &s->at, s->depth))
         out.hidden = TL_CULL_RIDGE;
