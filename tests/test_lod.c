@@ -582,7 +582,7 @@ static void expect_some_end(const world *w, const tl_view *view, tl_lod_options 
             if (!options.morph)
                 expect_sound(w, mesh);
             for (size_t k = 0; k < mesh->vertex_count; k++)
-                assert_true(isfinite(mesh->vertices[k].z));
+                assert_true(isfinite((double)mesh->vertices[k].z));
             assert_true(!options.budget || mesh->triangle_count <= options.budget);
         } else
             assert_true(error.text[0]);
