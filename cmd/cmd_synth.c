@@ -33,7 +33,7 @@ typedef struct settings {
     double quantum; /* step of the heights */
     bool quantum_given;
     double lerc_error;
-    bool lerc_error_given, mip_given, cog, half, one_file;
+    bool lerc_error_given, mip_given, cog, mask, half, one_file;
     bool size_given, hurst_given, delta_given;
     double max_error; /* of the framework that the DEM is reduced to first */
     bool max_error_given, verify;
@@ -82,6 +82,7 @@ static tl_status write_samples(const settings *set, const tl_source *made, const
                                 .texture_size = (int)set->common.texture_size,
                                 .split = (size_t)set->common.split,
                                 .cog = set->cog,
+                                .mask = set->mask,
                                 .lerc_error = set->lerc_error,
                                 .half_error = set->half ? set->quantum / 2 : 0,
                                 .validity = set->common.voids && strcmp(set->common.voids, "keep") != 0,
@@ -263,8 +264,8 @@ static bool grid_output_ok(const settings *set)
     unsigned textures;
     if (!command_textures(&set->common, &textures) || !command_split_ok(&set->common))
         return false;
-    if (set->preset && (set->mip || set->compression || set->cog)) {
-        complain("--preset decides how files are written; leave --mip, --compression and --cog away");
+    if (set->preset && (set->mip || set->compression || set->cog || set->mask)) {
+        complain("--preset decides how files are written; leave --mip, --compression, --cog and --mask away");
         return false;
     }
     if (set->tile && !set->preset) {
@@ -275,6 +276,8 @@ static bool grid_output_ok(const settings *set)
     bool exr = format && strcmp(format->ending, "exr") == 0, tif = format && strncmp(format->ending, "tif", 3) == 0;
     if (set->mip && !exr && !tif)
         complain("--mip: only .exr and .tif hold coarser levels, not %s; leave it out", set->common.output);
+    else if (set->mask && !tif)
+        complain("--mask is for .tif, not %s; leave it out", set->common.output);
     else if (set->cog && !tif)
         complain("--cog: is an order of .tif, not of %s; leave it out", set->common.output);
     else if (set->half && (!exr || !set->quantum_given || set->preset))
@@ -537,6 +540,8 @@ static void list_schemes(bool noise)
          0,                                                                                                           \
          0,                                                                                                           \
          compressions},                                                                                               \
+        {"mask", 0, OPTION_FLAG, &(s).mask, NULL, NULL, "in a .tif, tell voids by masks too, beside NaN as nodata",   \
+         0,      0, NULL},                                                                                            \
         {"half",                                                                                                      \
          0,                                                                                                           \
          OPTION_FLAG,                                                                                                 \

@@ -1019,7 +1019,8 @@ typedef struct tl_write_options {
     /* EXR: a mipmap down to one sample; GeoTIFF: overviews down to one tile of 256 x 256. Sizes are rounded up. They
      * take a third of the grid while it is written, of memory or, where the run may not take that, of disk. */
     tl_mip mip;
-    bool cog; /* GeoTIFF: in the order of cloud-optimised ones, by a second file without a name beside the first */
+    bool mask; /* GeoTIFF: also masks of one bit a sample, beside the NaN that voids are */
+    bool cog;  /* GeoTIFF: in the order of cloud-optimised ones, by a second file without a name beside the first */
     /* TL_COMPRESSION_LERC: by how much a height may move, in the source's unit; 0: not at all. */
     double lerc_error;
     /* EXR, above 0: as half floats, where this moves no height by more than that; else TL_ERROR_ARGUMENT. 0: floats. */

@@ -220,6 +220,40 @@ static void cogsAreInTheirOrder(void **state)
     free(bytes);
 }
 
+static void masksTellVoids(void **state)
+{
+    const bench *b = *state;
+    for (int cog = 0; cog < 2; cog++) {
+        write_ok(b, b->path, (tl_write_options){.mip = TL_MIP_LATTICE, .mask = true, .cog = cog});
+        TIFF *tiff = TIFFOpen(b->path, "r");
+        assert_non_null(tiff);
+        for (int level = 0; level < LEVELS; level++) { /* each behind its heights */
+            static unsigned char tile[TILE * TILE / 8];
+            uint32_t width, height, kind = 0;
+            assert_int_equal(TIFFSetDirectory(tiff, (tdir_t)(2 * level + 1)), 1);
+            assert_int_equal(TIFFGetField(tiff, TIFFTAG_SUBFILETYPE, &kind), 1);
+            assert_int_equal(kind, FILETYPE_MASK | (level ? FILETYPE_REDUCEDIMAGE : 0));
+            TIFFGetField(tiff, TIFFTAG_IMAGEWIDTH, &width);
+            TIFFGetField(tiff, TIFFTAG_IMAGELENGTH, &height);
+            for (uint32_t y = 0; y < height; y++)
+                for (uint32_t x = 0; x < width; x++) {
+                    if (x % TILE == 0)
+                        assert_int_equal(TIFFReadTile(tiff, tile, x, y, 0, 0), sizeof tile);
+                    size_t at = y % TILE * TILE + x % TILE;
+                    bool known = tile[at / 8] >> (7 - at % 8) & 1;
+                    assert_int_equal(known, !isnan(wanted(b, TL_MIP_LATTICE, level, x, y)));
+                }
+        }
+        assert_int_equal(TIFFSetDirectory(tiff, 2 * LEVELS), 0);
+        TIFFClose(tiff);
+        tl_source *back = tl_open(b->path, NULL); /* our own reader has its voids as before */
+        float z;
+        assert_int_equal(tl_source_read(back, 0, (tl_window){500, 300, 1, 1}, &z, NULL), TL_OK);
+        assert_true(isnan(z));
+        tl_source_destroy(back);
+    }
+}
+
 static void lercKeepsItsBound(void **state)
 {
     const bench *b = *state;
@@ -312,9 +346,11 @@ static void whatCannotBeIsTold(void **state)
 
 int main(void)
 {
+    TIFFSetWarningHandler(NULL); /* of GDAL's tags */
     const struct CMUnitTest tests[] = {
         cmocka_unit_test_setup_teardown(overviewsAreTheLevels, setUp, tearDown),
         cmocka_unit_test_setup_teardown(cogsAreInTheirOrder, setUp, tearDown),
+        cmocka_unit_test_setup_teardown(masksTellVoids, setUp, tearDown),
         cmocka_unit_test_setup_teardown(lercKeepsItsBound, setUp, tearDown),
         cmocka_unit_test_setup_teardown(bytesDoNotDependOnThreadsOrMemory, setUp, tearDown),
         cmocka_unit_test_setup_teardown(sampledOverviewsAreNoLevelsOfAreas, setUp, tearDown),

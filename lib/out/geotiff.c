@@ -17,6 +17,7 @@
 #include <geotiff/geotiffio.h>
 #include <geotiff/geovalues.h>
 #include <geotiff/xtiffio.h>
+#include <libdeflate.h>
 #include <tiffio.h>
 
 #include <errno.h>
@@ -327,10 +328,19 @@ static void pad_tile(unsigned char *samples, size_t size, tl_window window)
         memcpy(samples + (size_t)row * stride, samples + (size_t)(window.height - 1) * stride, stride);
 }
 
+enum { MASK_BYTES = OUT_TILE * OUT_TILE / 8, MASK_LEVEL = 6 };
+
 typedef struct worker {
     void *samples; /* floats, or bytes of validity */
     out_packer *packer;
+    struct libdeflate_compressor *masks; /* NULL: none are wanted */
 } worker;
+
+/* A tile of a mask, compressed. */
+typedef struct mask_tile {
+    unsigned char *bytes;
+    size_t count;
+} mask_tile;
 
 typedef struct writing {
     const tl_source *const *bands;
@@ -340,6 +350,9 @@ typedef struct writing {
     int level;
     out_tiling tiling; /* of the level in hand */
     worker *workers;
+    bool masked;
+    mask_tile
+        *masks; /* of the level in hand, kept until its heights are written: a few dozen bytes where all is known */
     complaint said;
 } writing;
 
@@ -370,6 +383,56 @@ static bool is_empty(const float *heights, size_t count)
     return at == count;
 }
 
+/* One bit a sample, the first the highest: 1 where it is known. */
+static tl_status pack_mask(const float *heights, worker *self, mask_tile *out, tl_error *error)
+{
+    unsigned char bits[MASK_BYTES] = {0};
+    for (int i = 0; i < OUT_TILE * OUT_TILE; i++)
+        bits[i / 8] |= (unsigned char)(!isnan(heights[i]) << (7 - i % 8));
+    size_t room = libdeflate_zlib_compress_bound(self->masks, sizeof bits);
+    out->bytes = malloc(room);
+    if (!out->bytes)
+        return tl_fail_memory(error, "the mask");
+    out->count = libdeflate_zlib_compress(self->masks, bits, sizeof bits, out->bytes, room);
+    unsigned char *fitted = realloc(out->bytes, out->count);
+    out->bytes = fitted ? fitted : out->bytes;
+    return TL_OK;
+}
+
+static bool set_mask_directory(TIFF *tiff, const out_mip *mip, int level)
+{
+    return TIFFSetField(tiff, TIFFTAG_SUBFILETYPE, FILETYPE_MASK | (level ? FILETYPE_REDUCEDIMAGE : 0)) == 1 &&
+           TIFFSetField(tiff, TIFFTAG_IMAGEWIDTH, (uint32_t)mip->levels[level].width) == 1 &&
+           TIFFSetField(tiff, TIFFTAG_IMAGELENGTH, (uint32_t)mip->levels[level].height) == 1 &&
+           TIFFSetField(tiff, TIFFTAG_TILEWIDTH, OUT_TILE) == 1 &&
+           TIFFSetField(tiff, TIFFTAG_TILELENGTH, OUT_TILE) == 1 && TIFFSetField(tiff, TIFFTAG_BITSPERSAMPLE, 1) == 1 &&
+           TIFFSetField(tiff, TIFFTAG_SAMPLESPERPIXEL, 1) == 1 &&
+           TIFFSetField(tiff, TIFFTAG_PLANARCONFIG, PLANARCONFIG_CONTIG) == 1 &&
+           TIFFSetField(tiff, TIFFTAG_PHOTOMETRIC, PHOTOMETRIC_MASK) == 1 &&
+           TIFFSetField(tiff, TIFFTAG_COMPRESSION, COMPRESSION_ADOBE_DEFLATE) == 1;
+}
+
+/* The mask of the level that was just written. */
+static tl_status write_mask(writing *w, uint64_t tiles, tl_error *error)
+{
+    errno = 0;
+    bool good = set_mask_directory(w->tiff, &w->mip, w->level);
+    for (uint64_t k = 0; good && k < tiles; k++)
+        good = TIFFWriteRawTile(w->tiff, (uint32_t)k, w->masks[k].bytes, (tmsize_t)w->masks[k].count) ==
+               (tmsize_t)w->masks[k].count;
+    if (good && TIFFWriteDirectory(w->tiff) && !w->said.made)
+        return TL_OK;
+    return tiff_failed(w->packing.path, &w->said, error);
+}
+
+static void drop_masks(writing *w, uint64_t tiles)
+{
+    for (uint64_t k = 0; w->masks && k < tiles; k++)
+        free(w->masks[k].bytes);
+    free(w->masks);
+    w->masks = NULL;
+}
+
 static tl_status write_tile(void *context, tl_parallel *loop, uint64_t tile, unsigned index, tl_error *error)
 {
     writing *w = context;
@@ -380,6 +443,8 @@ static tl_status write_tile(void *context, tl_parallel *loop, uint64_t tile, uns
     bool left_out = status == TL_OK && bands > 1 && is_empty(self->samples, bands * OUT_TILE * OUT_TILE);
     if (status == TL_OK)
         status = out_packer_pack(self->packer, self->samples, &bytes, &count, error);
+    if (status == TL_OK && w->masks)
+        status = pack_mask(self->samples, self, &w->masks[tile], error);
     if (status != TL_OK)
         return status;
     if (!tl_parallel_wait_turn(loop, tile))
@@ -400,10 +465,15 @@ static tl_status write_level(writing *w, const tl_run *run, tl_error *error)
     errno = 0;
     if (!set_directory(w->tiff, &w->bands[0]->info, &w->packing, &w->mip, w->level))
         return tiff_failed(w->packing.path, &w->said, error);
+    if (w->masked && !(w->masks = calloc((size_t)tiles, sizeof *w->masks)))
+        return tl_fail_memory(error, w->packing.path);
     tl_status status = tl_parallel_for(run, tiles, (uint64_t)(width * height), write_tile, w, error);
     errno = 0;
     if (status == TL_OK && (!TIFFWriteDirectory(w->tiff) || w->said.made))
         status = tiff_failed(w->packing.path, &w->said, error);
+    if (status == TL_OK && w->masked)
+        status = write_mask(w, tiles, error);
+    drop_masks(w, tiles);
     return status;
 }
 
@@ -421,7 +491,8 @@ static tl_status write_levels(writing *w, const tl_run *run, tl_error *error)
     for (unsigned i = 0; i < count; i++) {
         w->workers[i].samples = malloc(w->packing.bands * TILE_BYTES);
         w->workers[i].packer = out_packer_create(&w->packing);
-        if (!w->workers[i].samples || !w->workers[i].packer)
+        w->workers[i].masks = w->masked ? libdeflate_alloc_compressor(MASK_LEVEL) : NULL;
+        if (!w->workers[i].samples || !w->workers[i].packer || (w->masked && !w->workers[i].masks))
             status = tl_fail_memory(error, w->packing.path);
     }
     for (w->level = 0; w->level < w->mip.count && status == TL_OK; w->level++)
@@ -429,6 +500,8 @@ static tl_status write_levels(writing *w, const tl_run *run, tl_error *error)
     for (unsigned i = 0; i < count; i++) {
         free(w->workers[i].samples);
         out_packer_destroy(w->workers[i].packer);
+        if (w->workers[i].masks)
+            libdeflate_free_compressor(w->workers[i].masks);
     }
     free(w->workers);
     return status;
@@ -500,20 +573,21 @@ static tl_status check_size(const tl_source_info *info, const char *path, tl_err
 }
 
 /* Overviews stop where one tile holds all. */
-static tl_status write_geotiff(const tl_source *const *bands, const out_packing *packing, tl_mip mip, bool cog,
-                               tl_output *output, const tl_run *run, tl_error *error)
+static tl_status write_geotiff(const tl_source *const *bands, const out_packing *packing,
+                               const tl_write_options *options, tl_output *output, tl_error *error)
 {
+    const tl_run *run = options->run;
     const tl_source_info *info = &bands[0]->info;
-    writing w = {.bands = bands, .packing = *packing, .tiling = out_tiling_of(bands[0])};
+    writing w = {.bands = bands, .packing = *packing, .tiling = out_tiling_of(bands[0]), .masked = options->mask};
     tl_status status = check_size(info, packing->path, error);
     if (status == TL_OK)
         status = out_packing_check(packing, error);
     if (status == TL_OK)
-        status = out_mip_init(&w.mip, mip, OUT_TILE, info->width, info->height, run, packing->path, error);
+        status = out_mip_init(&w.mip, options->mip, OUT_TILE, info->width, info->height, run, packing->path, error);
     if (status != TL_OK)
         return status;
-    status =
-        cog ? write_cog(&w, output, run, error) : write_tiff(&w, output, most_bytes(&w) > classic_limit, run, error);
+    status = options->cog ? write_cog(&w, output, run, error)
+                          : write_tiff(&w, output, most_bytes(&w) > classic_limit, run, error);
     out_mip_finish(&w.mip);
     return status;
 }
@@ -525,7 +599,7 @@ tl_status out_geotiff_write(const tl_source *source, tl_output *output, const tl
                                  .compression = options->compression,
                                  .bands = 1,
                                  .lerc_error = options->lerc_error};
-    return write_geotiff(&source, &packing, options->mip, options->cog, output, options->run, error);
+    return write_geotiff(&source, &packing, options, output, error);
 }
 
 tl_status out_validity_write(const tl_source *source, tl_output *output, const tl_write_options *options,
@@ -536,12 +610,12 @@ tl_status out_validity_write(const tl_source *source, tl_output *output, const t
                                                                                             : TL_COMPRESSION_DEFLATE,
                                  .bytes = true,
                                  .bands = 1};
-    return write_geotiff(&source, &packing, TL_MIP_NONE, false, output, options->run, error);
+    return write_geotiff(&source, &packing, &(tl_write_options){.run = options->run}, output, error);
 }
 
 tl_status out_geotiff_write_bands(const tl_source *const *bands, size_t count, tl_output *output,
                                   const tl_write_options *options, tl_error *error)
 {
     const out_packing packing = {.path = tl_output_path(output), .compression = options->compression, .bands = count};
-    return write_geotiff(bands, &packing, TL_MIP_NONE, false, output, options->run, error);
+    return write_geotiff(bands, &packing, &(tl_write_options){.run = options->run}, output, error);
 }
