@@ -369,7 +369,7 @@ static void partsJoin(void **state)
     enum { SPLIT = 500 };
     double(*known)[6] = malloc(sizeof *known * WIDTH * HEIGHT);
     for (int k = 0; k < WIDTH * HEIGHT; k++)
-        known[k][0] = NAN;
+        known[k][0] = (double)NAN;
     glb g = write_glb(b, (tl_write_options){0});
     assert_int_equal(gather(b, &g, known), 0);
     close_glb(&g);
