@@ -1182,6 +1182,54 @@ typedef struct tl_preset_report {
 TL_API tl_status tl_write_preset(const tl_source *source, const char *path, const tl_preset_options *options,
                                  tl_preset_report *out, tl_error *error);
 
+/* ---- Tiles of the globe ---------------------------------------------------------------------------- */
+
+enum { TL_TILE_LEVELS = 25 };
+
+typedef struct tl_tiles_options {
+    /* Largest vertical distance, in metres, of the tiles of the deepest level from the heights on their lattice, > 0;
+     * it doubles from level to level upwards. 0: a quarter of what globes take the level for, 77067 m / 2^level. */
+    double max_error;
+    int first_level; /* the coarsest level that is written; 0: from the two roots on */
+    int last_level;  /* the deepest, where last_level_given; else the first whose cells are no larger than the source's
+                      */
+    bool last_level_given;
+    bool no_normals;         /* leave out the normals of vertices */
+    double outside;          /* metres: the height of ground that the source does not know */
+    const char *attribution; /* for the page that shows it; NULL: none */
+    /* Go on with what an earlier call with the same options and source has left in the folder. */
+    bool resume;
+    /* One of `shards` parts, counted from 0, that may run at the same time on any machines with one folder: it makes
+     * every shards-th block of the deepest lattice. `finish` then makes all the rest. shards 0: everything. */
+    unsigned shard, shards;
+    bool finish;
+    bool dry_run; /* write nothing; tell how many tiles there will be at most */
+    const tl_run *run;
+} tl_tiles_options;
+
+typedef struct tl_tiles_level {
+    uint64_t tiles, triangles, vertices, bytes;
+    double error; /* metres: no tile's surface is farther from the heights on the deepest lattice */
+} tl_tiles_level;
+
+typedef struct tl_tiles_report {
+    int first_level, last_level;
+    tl_tiles_level levels[TL_TILE_LEVELS];
+    double spacing;               /* of the deepest lattice, degrees */
+    uint64_t blocks, done_before; /* of the work; those that an earlier call had done */
+    bool complete;                /* the pyramid can be shown: layer.json is there */
+} tl_tiles_report;
+
+/* Writes a source as a pyramid of quantized-mesh 1.0 tiles for globes: FOLDER/LEVEL/COLUMN/ROW.terrain in the
+ * geographic scheme (EPSG:4326, rows from the south), gzipped, and FOLDER/layer.json. The folder must be empty or not
+ * there, unless resume, shards or finish go on with it. Heights are taken as above the ellipsoid (see
+ * tl_geoid_create). The deepest level is 64 x 64 cells of the lattice a tile, onto which the source is interpolated by
+ * a cubic; levels above are drawn from every second vertex of the next ones, and count what these leave out. Tiles of
+ * one level share the vertices of their edges. Takes some 64 MB a worker. TL_ERROR_ARGUMENT where it is not known
+ * where the source lies. */
+TL_API tl_status tl_write_terrain_tiles(const tl_source *source, const char *folder, const tl_tiles_options *options,
+                                        tl_tiles_report *out, tl_error *error);
+
 /* ---- Pictures ---------------------------------------------------------------------------------- */
 
 typedef struct tl_preview_options {

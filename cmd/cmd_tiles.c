@@ -1,0 +1,215 @@
+#include "cmd/command.h"
+
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+enum { FORMAT_QUANTIZED_MESH };
+static const char *const formats[] = {[FORMAT_QUANTIZED_MESH] = "quantized-mesh", NULL};
+
+typedef struct settings {
+    common common;
+    int format;
+    double max_error;
+    int64_t extra, seed;
+    const char *levels, *shard, *attribution;
+    bool no_normals, resume, finish, dry_run;
+    double outside;
+    tl_field_options field;
+} settings;
+
+/* "A..B"; false, told. */
+static bool read_levels(const char *text, tl_tiles_options *out)
+{
+    char rest;
+    if (!text)
+        return true;
+    if (sscanf(text, "%d..%d%c", &out->first_level, &out->last_level, &rest) != 2 || out->first_level < 0 ||
+        out->last_level < out->first_level || out->last_level >= TL_TILE_LEVELS) {
+        complain("--levels: A..B is wanted, 0...%d and not falling, not '%s'", TL_TILE_LEVELS - 1, text);
+        return false;
+    }
+    out->last_level_given = true;
+    return true;
+}
+
+/* What runs many tasks tells each of them its number and how many there are. */
+static bool shard_of_environment(long *index, long *count)
+{
+    static const struct {
+        const char *index, *count, *first;
+    } variables[] = {{"SLURM_ARRAY_TASK_ID", "SLURM_ARRAY_TASK_COUNT", "SLURM_ARRAY_TASK_MIN"},
+                     {"OMPI_COMM_WORLD_RANK", "OMPI_COMM_WORLD_SIZE", NULL},
+                     {"PMI_RANK", "PMI_SIZE", NULL},
+                     {"JOB_COMPLETION_INDEX", "JOB_COMPLETIONS", NULL},
+                     {"SLURM_PROCID", "SLURM_NTASKS", NULL}};
+    for (size_t k = 0; k < sizeof variables / sizeof *variables; k++) {
+        const char *i = getenv(variables[k].index), *n = getenv(variables[k].count);
+        const char *first = variables[k].first ? getenv(variables[k].first) : NULL;
+        if (!i || !n)
+            continue;
+        *index = strtol(i, NULL, 10) - (first ? strtol(first, NULL, 10) : 0);
+        *count = strtol(n, NULL, 10);
+        return true;
+    }
+    return false;
+}
+
+/* "I/N", counted from 0, or "auto"; false, told. */
+static bool read_shard(const char *text, tl_tiles_options *out)
+{
+    long index, count;
+    char rest;
+    if (!text)
+        return true;
+    if (strcmp(text, "auto") == 0) {
+        if (!shard_of_environment(&index, &count)) {
+            complain("--shard auto: none of SLURM_ARRAY_TASK_ID, SLURM_PROCID, OMPI_COMM_WORLD_RANK, PMI_RANK and "
+                     "JOB_COMPLETION_INDEX is set with its count; give I/N");
+            return false;
+        }
+    } else if (sscanf(text, "%ld/%ld%c", &index, &count, &rest) != 2)
+        index = count = -1;
+    if (count < 1 || count > 1000000 || index < 0 || index >= count) {
+        complain("--shard: I/N is wanted, with I from 0 to N - 1, or auto, not '%s'", text);
+        return false;
+    }
+    out->shard = (unsigned)index;
+    out->shards = (unsigned)count;
+    return true;
+}
+
+static void report(const settings *set, const tl_tiles_report *r, double seconds)
+{
+    const char *folder = set->common.output;
+    uint64_t tiles = 0, bytes = 0;
+    for (int k = r->first_level; k <= r->last_level; k++) {
+        tiles += r->levels[k].tiles;
+        bytes += r->levels[k].bytes;
+    }
+    if (set->dry_run) {
+        command_say(&set->common, "%s: at most %llu tiles of levels %d ... %d from %llu blocks; cells of %.3g degrees",
+                    folder, (unsigned long long)tiles, r->first_level, r->last_level, (unsigned long long)r->blocks,
+                    r->spacing);
+        return;
+    }
+    for (int k = r->first_level; k <= r->last_level; k++)
+        if (r->levels[k].tiles)
+            command_say(&set->common, "level %-3d %8llu tiles %10llu triangles %11llu bytes, error <= %.4g m", k,
+                        (unsigned long long)r->levels[k].tiles, (unsigned long long)r->levels[k].triangles,
+                        (unsigned long long)r->levels[k].bytes, r->levels[k].error);
+    command_say(&set->common, "%s: %llu tiles, %llu bytes, %.2f s%s", folder, (unsigned long long)tiles,
+                (unsigned long long)bytes, seconds, r->complete ? "" : "; not complete until --finish");
+}
+
+/* The DEM, or what is made below its samples. */
+static const tl_source *refine(const settings *set, const tl_source *dem, const tl_run *run, tl_source **field,
+                               tl_error *error)
+{
+    tl_field_options options = set->field;
+    options.levels = (int)set->extra;
+    options.seed = (uint64_t)set->seed;
+    options.run = run;
+    *field = set->extra ? tl_field_create(dem, &options, error) : NULL;
+    return set->extra ? *field : dem;
+}
+
+static int make_tiles(const settings *set, const arguments *inputs, tl_tiles_options *options)
+{
+    progress bar;
+    tl_error error;
+    tl_tiles_report made;
+    tl_source *field = NULL;
+    tl_run run = command_run(&set->common, &bar);
+    opened_input opened = command_open(&set->common, inputs, &run, &error);
+    if (!opened.source)
+        return command_failed(&bar, &error);
+    progress_stage(&bar, "measuring");
+    const tl_source *source = refine(set, opened.source, &run, &field, &error);
+    options->run = &run;
+    int status = EXIT_DONE;
+    if (source)
+        progress_stage(&bar, "tiles");
+    if (!source || tl_write_terrain_tiles(source, set->common.output, options, &made, &error) != TL_OK)
+        status = command_failed(&bar, &error);
+    else
+        report(set, &made, progress_end(&bar));
+    tl_source_destroy(field);
+    command_close(&opened);
+    return status;
+}
+
+static bool output_ok(const settings *set)
+{
+    if (set->common.output && *set->common.output)
+        return true;
+    complain("no folder named; give -o FOLDER");
+    return false;
+}
+
+static int run_tiles(const command *self, int argc, const char **argv, bool help)
+{
+    settings set = {0};
+    const option tiles[] = {
+        {"output", 'o', OPTION_TEXT, &set.common.output, NULL, "FOLDER", "where the tiles go: a new or empty folder", 0,
+         0, NULL},
+        {"format", 'f', OPTION_CHOICE, &set.format, NULL, "KIND", "of the tiles (default: quantized-mesh)", 0, 0,
+         formats},
+        {"error", 'e', OPTION_NUMBER, &set.max_error, NULL, "METRES",
+         "largest error of the deepest level, 0.001...1e6; twice as much a level above (default: a quarter of what "
+         "globes take the level for)",
+         0.001, 1e6, NULL},
+        {"levels", 'l', OPTION_TEXT, &set.levels, NULL, "A..B",
+         "of tiles (default: from 0 to the first whose cells are no larger than the DEM's)", 0, 0, NULL},
+        {"no-normals", 0, OPTION_FLAG, &set.no_normals, NULL, NULL, "leave the vertices' normals away", 0, 0, NULL},
+        {"outside", 0, OPTION_NUMBER, &set.outside, NULL, "METRES",
+         "height of ground that the DEM does not know (default: 0)", -1e5, 1e5, NULL},
+        {"attribution", 0, OPTION_TEXT, &set.attribution, NULL, "TEXT", "to be shown with the terrain", 0, 0, NULL},
+        {"dry-run", 'n', OPTION_FLAG, &set.dry_run, NULL, NULL, "only tell how many tiles there will be", 0, 0, NULL},
+        {0}};
+    const option detail[] = {
+        {"extra-levels", 'x', OPTION_INTEGER, &set.extra, NULL, "N",
+         "levels finer than the DEM, with fractal detail, 0...10 (default: 0)", 0, 10, NULL},
+        {"seed", 's', OPTION_INTEGER, &set.seed, NULL, "N", "another seed, another terrain, 0...2^62 (default: 0)", 0,
+         0x1p62, NULL},
+        {"hurst", 0, OPTION_NUMBER, &set.field.hurst, &set.field.hurst_given, "H",
+         "Hurst exponent of the detail, 0.01...0.99 (default: measured from the DEM, octave by octave)", 0.01, 0.99,
+         NULL},
+        {"delta", 0, OPTION_NUMBER, &set.field.delta, &set.field.delta_given, "D",
+         "standard deviation of the height difference over one DEM sample (default: measured)", 0, 1e30, NULL},
+        {0}};
+    const option parts[] = {
+        {"resume", 0, OPTION_FLAG, &set.resume, NULL, NULL, "go on with a folder where an earlier run was interrupted",
+         0, 0, NULL},
+        {"shard", 0, OPTION_TEXT, &set.shard, NULL, "I/N",
+         "make one of N parts, counted from 0, with the others beside it; auto: as Slurm, Open MPI or Kubernetes say",
+         0, 0, NULL},
+        {"finish", 0, OPTION_FLAG, &set.finish, NULL, NULL, "after all shards: make the levels above and layer.json", 0,
+         0, NULL},
+        {0}};
+    const option input[] = {COMMON_INPUT(set.common), {0}};
+    const option running[] = {COMMON_RUNNING(set.common), {0}};
+    const option_group groups[] = {{"Tiles", tiles}, {"Detail", detail},   {"In parts", parts},
+                                   {"Input", input}, {"Running", running}, {0}};
+    arguments rest;
+    int status;
+    if (!command_begin(self, argc, argv, help, groups, -1, &rest, &status))
+        return status;
+    tl_tiles_options options = {.max_error = set.max_error,
+                                .no_normals = set.no_normals,
+                                .outside = set.outside,
+                                .attribution = set.attribution,
+                                .resume = set.resume,
+                                .finish = set.finish,
+                                .dry_run = set.dry_run};
+    bool good = output_ok(&set) && read_levels(set.levels, &options) && read_shard(set.shard, &options);
+    status = good ? make_tiles(&set, &rest, &options) : EXIT_USAGE;
+    arguments_free(&rest);
+    return status;
+}
+
+const command command_tiles = {
+    "tiles", "cut an elevation model into tiles for web globes", "DEM... -o FOLDER [--error METRES]",
+    INPUT_NOTES "\n\nHeights are taken as above the ellipsoid; --geoid egm96 makes those above the sea so.\n\n"
+                "Example: talus tiles dem.tif --geoid egm96 --error 1 -o site",
+    run_tiles};
