@@ -98,6 +98,7 @@ static void report(const settings *set, const tl_tiles_report *r, double seconds
             command_say(&set->common, "level %-3d %8llu tiles %10llu triangles %11llu bytes, error <= %.4g m", k,
                         (unsigned long long)r->levels[k].tiles, (unsigned long long)r->levels[k].triangles,
                         (unsigned long long)r->levels[k].bytes, r->levels[k].error);
+    command_say(&set->common, "the DEM's samples are within %.4g m of the deepest lattice's surface", r->resampling);
     command_say(&set->common, "%s: %llu tiles, %llu bytes, %.2f s%s", folder, (unsigned long long)tiles,
                 (unsigned long long)bytes, seconds, r->complete ? "" : "; not complete until --finish");
 }

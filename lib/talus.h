@@ -1215,6 +1215,9 @@ typedef struct tl_tiles_level {
 typedef struct tl_tiles_report {
     int first_level, last_level;
     tl_tiles_level levels[TL_TILE_LEVELS];
+    /* Metres: the largest difference between the source's samples and the surface over the deepest lattice; it comes on
+     * top of the levels' errors. */
+    double resampling;
     double spacing;               /* of the deepest lattice, degrees */
     uint64_t blocks, done_before; /* of the work; those that an earlier call had done */
     bool complete;                /* the pyramid can be shown: layer.json is there */

@@ -10,7 +10,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { HEADER = 88, MOST = 32767, LEVEL = 6, OCT_NORMALS = 1, METADATA = 4, LINE = SCENE_RIM + 1 };
+enum { HEADER = 88, MOST = 32767, LEVEL = 3, OCT_NORMALS = 1, METADATA = 4, LINE = SCENE_RIM + 1 };
 
 /* WGS 84, metres. */
 static const double semi_major = 6378137, flattening = 1 / 298.257223563;

@@ -26,7 +26,16 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
-enum { ROW = SCENE_BLOCK_VERTICES, ROOT_LATTICE = 2, METADATA_LEVELS = 10, WORKER_BYTES = 64 << 20 };
+enum {
+    ROW = SCENE_BLOCK_VERTICES,
+    ROOT_LATTICE = 2,
+    METADATA_LEVELS = 10,
+    WORKER_BYTES = 80 << 20,
+    /* Vertices around what is known take heights from there, so that the step down to the height outside is beyond what
+     * is known, on every lattice. More are read around a block, so that this comes out alike in all blocks. */
+    GROWTH = 4,
+    WIDE = ROW + 2 * GROWTH,
+};
 
 static const double earth = 6378137, pi = 3.14159265358979323846;
 
@@ -61,7 +70,8 @@ typedef struct worker {
     scene_block block;
     scene_tile_mesh mesh;
     out_terrain_buffer buffer;
-    unsigned char *known; /* of the deepest lattice: whether the source has a height at a vertex of the core */
+    float *wide;          /* WIDE^2 heights, NaN where none is known; at first */
+    unsigned char *known; /* of the block's vertices: whether they have a height of the source */
 } worker;
 
 /* ---- Bounds ---- */
@@ -103,42 +113,83 @@ static int64_t blocks_down(int level)
     return tl_int64_max(scene_geodetic_rows(level) / SCENE_BLOCK, 1);
 }
 
-/* Heights below the poles and where nothing is known. */
-static void fill_outside(const job *j, float *z, size_t count)
+/* The mean of the known ones around a vertex; NaN where there are none. */
+static float mean_around(const float *z, int x, int y)
 {
-    for (size_t k = 0; k < count; k++)
-        z[k] = isfinite(z[k]) ? z[k] : (float)j->options->outside;
+    double sum = 0;
+    int count = 0;
+    for (int k = 0; k < 9; k++) {
+        int i = x + k % 3 - 1, j = y + k / 3 - 1;
+        if (i < 0 || j < 0 || i >= WIDE || j >= WIDE || !isfinite(z[j * WIDE + i]))
+            continue;
+        sum += (double)z[j * WIDE + i];
+        count++;
+    }
+    return count ? (float)(sum / count) : NAN;
 }
 
-static tl_status read_heights(const job *j, const block_place *at, worker *w, bool *empty, tl_error *error)
+/* One vertex outwards. `rows` has room for two rows, those as they were. */
+static void grow(float *z, float *rows)
 {
-    const tl_window window = {at->column * SCENE_BLOCK - SCENE_RIM, at->row * SCENE_BLOCK - SCENE_RIM, ROW, ROW};
-    tl_status status = scene_geodetic_read(j->lattice, window, w->block.z, error);
+    float *fresh = rows, *last = rows + WIDE;
+    for (int y = 0; y < WIDE; y++) {
+        for (int x = 0; x < WIDE; x++)
+            fresh[x] = isfinite(z[y * WIDE + x]) ? z[y * WIDE + x] : mean_around(z, x, y);
+        /* the row before is not looked at any more */
+        if (y)
+            memcpy(z + (size_t)(y - 1) * WIDE, last, WIDE * sizeof *z);
+        float *swapped = fresh;
+        fresh = last;
+        last = swapped;
+    }
+    memcpy(z + (size_t)(WIDE - 1) * WIDE, last, WIDE * sizeof *z);
+}
+
+/* Takes the block out of the wide heights, without what is not known; *empty: nothing is known in its core. */
+static tl_status take_heights(const job *j, worker *w, bool *empty, tl_error *error)
+{
+    bool all = true;
     *empty = true;
-    for (int y = 0; y <= SCENE_BLOCK && status == TL_OK; y++)
-        for (int x = 0; x <= SCENE_BLOCK; x++) {
-            bool known = isfinite(w->block.z[(y + SCENE_RIM) * ROW + x + SCENE_RIM]);
-            w->known[y * (SCENE_BLOCK + 1) + x] = known;
-            *empty = *empty && !known;
+    for (int y = 0; y < ROW; y++)
+        for (int x = 0; x < ROW; x++) {
+            bool known = isfinite(w->wide[(y + GROWTH) * WIDE + x + GROWTH]);
+            w->known[y * ROW + x] = known;
+            all = all && known;
+            if (known && x >= SCENE_RIM && y >= SCENE_RIM && x <= SCENE_RIM + SCENE_BLOCK &&
+                y <= SCENE_RIM + SCENE_BLOCK)
+                *empty = false;
         }
-    fill_outside(j, w->block.z, (size_t)ROW * ROW);
-    return status;
+    float *rows = all || *empty ? NULL : tl_alloc(2 * WIDE, sizeof *rows);
+    if (!all && !*empty && !rows)
+        return tl_fail_memory(error, "a block of tiles");
+    for (int k = 0; rows && k < GROWTH; k++)
+        grow(w->wide, rows);
+    free(rows);
+    for (int y = 0; y < ROW; y++)
+        for (int x = 0; x < ROW; x++) {
+            float z = w->wide[(y + GROWTH) * WIDE + x + GROWTH];
+            w->block.z[y * ROW + x] = isfinite(z) ? z : (float)j->options->outside;
+        }
+    return TL_OK;
 }
 
-/* The vertices and cells that a piece gives to a block whose first vertex is (x0, y0): there may be several places
- * around a small world. */
+static tl_status read_heights(const job *j, const block_place *at, worker *w, tl_error *error)
+{
+    int64_t rim = SCENE_RIM + GROWTH;
+    const tl_window window = {at->column * SCENE_BLOCK - rim, at->row * SCENE_BLOCK - rim, WIDE, WIDE};
+    return scene_geodetic_read(j->lattice, window, w->wide, error);
+}
+
+/* The vertices and cells that a piece gives to a block, from vertex (x0, y0) of its wide heights on. */
 static void paste(const out_piece *piece, int64_t x0, int64_t y0, worker *w)
 {
-    for (int64_t y = 0; y < OUT_PIECE; y++) {
-        int64_t to = y0 + y;
-        if (to < 0 || to >= ROW)
-            continue;
-        for (int64_t x = tl_int64_max(0, -x0); x < tl_int64_min(OUT_PIECE, ROW - x0); x++) {
-            w->block.z[to * ROW + x0 + x] = piece->z[y * OUT_PIECE + x];
-            if (to < SCENE_BLOCK_SIDE && x0 + x < SCENE_BLOCK_SIDE)
-                w->block.lost[to * SCENE_BLOCK_SIDE + x0 + x] = piece->lost[y * OUT_PIECE + x];
+    for (int64_t y = tl_int64_max(0, -y0); y < tl_int64_min(OUT_PIECE, WIDE - y0); y++)
+        for (int64_t x = tl_int64_max(0, -x0); x < tl_int64_min(OUT_PIECE, WIDE - x0); x++) {
+            int64_t i = x0 + x - GROWTH, j = y0 + y - GROWTH;
+            w->wide[(y0 + y) * WIDE + x0 + x] = piece->z[y * OUT_PIECE + x];
+            if (i >= 0 && j >= 0 && i < SCENE_BLOCK_SIDE && j < SCENE_BLOCK_SIDE)
+                w->block.lost[j * SCENE_BLOCK_SIDE + i] = piece->lost[y * OUT_PIECE + x];
         }
-    }
 }
 
 /* From the pieces of the finer lattice. A piece is as wide as the world of the lattice of the roots. */
@@ -146,8 +197,8 @@ static tl_status gather_heights(const job *j, const block_place *at, worker *w, 
 {
     int64_t across = blocks_across(j->level + 1), down = blocks_down(j->level + 1);
     tl_status status = TL_OK;
-    for (size_t k = 0; k < (size_t)ROW * ROW; k++)
-        w->block.z[k] = (float)j->options->outside;
+    for (size_t k = 0; k < (size_t)WIDE * WIDE; k++)
+        w->wide[k] = NAN;
     memset(w->block.lost, 0, (size_t)SCENE_BLOCK_SIDE * SCENE_BLOCK_SIDE * sizeof *w->block.lost);
     for (int k = 0; k < 16 && status == TL_OK; k++) {
         int64_t column = 2 * at->column + k % 4 - 1, row = 2 * at->row + k / 4 - 1;
@@ -157,8 +208,8 @@ static tl_status gather_heights(const job *j, const block_place *at, worker *w, 
             continue;
         status = out_piece_load(&piece, j->folder, true, &found, error);
         if (status == TL_OK && found && piece.z)
-            paste(&piece, column * OUT_PIECE - at->column * SCENE_BLOCK + SCENE_RIM,
-                  row * OUT_PIECE - at->row * SCENE_BLOCK + SCENE_RIM, w);
+            paste(&piece, column * OUT_PIECE - at->column * SCENE_BLOCK + SCENE_RIM + GROWTH,
+                  row * OUT_PIECE - at->row * SCENE_BLOCK + SCENE_RIM + GROWTH, w);
         out_piece_finish(&piece);
     }
     return status;
@@ -168,8 +219,8 @@ static tl_status gather_heights(const job *j, const block_place *at, worker *w, 
 
 static bool any_known(const worker *w, int x, int y, int cells)
 {
-    for (int row = y; row <= y + cells; row++)
-        if (memchr(w->known + (size_t)row * (SCENE_BLOCK + 1) + x, 1, (size_t)cells + 1))
+    for (int row = SCENE_RIM + y; row <= SCENE_RIM + y + cells; row++)
+        if (memchr(w->known + (size_t)row * ROW + SCENE_RIM + x, 1, (size_t)cells + 1))
             return true;
     return false;
 }
@@ -241,15 +292,16 @@ static tl_status write_tile(const job *j, const out_piece_tile *tile, const out_
 static double shift_of(const job *j, const scene_tile_mesh *mesh)
 {
     float outside = (float)j->options->outside;
-    double steepest = 0;
+    double steepest = 0; /* squared */
     for (size_t k = 0; k < 3 * mesh->triangle_count; k++) {
         const struct scene_tile_vertex *a = &mesh->vertices[mesh->indices[k]],
                                        *b = &mesh->vertices[mesh->indices[k % 3 == 2 ? k - 2 : k + 1]];
-        double along = hypot(a->i - b->i, a->j - b->j);
-        if (a->z != outside && b->z != outside) /* the wall around the source is no ground */
-            steepest = fmax(steepest, fabs((double)a->z - (double)b->z) / along);
+        double i = a->i - b->i, l = a->j - b->j, rise = (double)a->z - (double)b->z;
+        double slope = rise * rise / (i * i + l * l);
+        if (slope > steepest && a->z != outside && b->z != outside) /* the wall around the source is no ground */
+            steepest = slope;
     }
-    return steepest * mesh->cells / 32767 * sqrt(0.5) * sqrt(2.0);
+    return sqrt(steepest) * mesh->cells / 32767;
 }
 
 /* Draws, encodes and writes the tile whose first vertex is (x, y) of the block's core. */
@@ -279,9 +331,9 @@ static tl_status make_tile(const job *j, worker *w, const double *limits, const 
     tile->checksum = libdeflate_crc32(0, w->buffer.packed, w->buffer.packed_count);
     tile->triangles = w->mesh.triangle_count;
     tile->vertices = w->mesh.vertex_count;
-    tile->error = fmax(bound_of(j, tile->level), sag(j->level, 0)); /* of what the limits let pass, with its sag */
-    if (w->mesh.error + sag(j->level, SCENE_TILE_SIZES - 1) < tile->error)
-        tile->error = w->mesh.error + sag(j->level, SCENE_TILE_SIZES - 1);
+    /* what the limits let pass, with the sag of the largest triangles, is below the bound */
+    double left_out = fmin(w->mesh.error + sag(j->level, SCENE_TILE_SIZES - 1), bound_of(j, tile->level));
+    tile->error = fmax(left_out, w->mesh.lost + sag(j->level, 0));
     tile->error += quantum / 2 + shift_of(j, &w->mesh);
     return write_tile(j, tile, &w->buffer, error);
 }
@@ -333,8 +385,18 @@ static tl_status make_tiles(const job *j, worker *w, const block_place *at, out_
 
 /* ---- Blocks ---- */
 
-/* Every second vertex of the core, and what the cells between them have lost: the error of the vertex in their middle
- * is that of the two triangles of the cell. */
+/* Whether one of the nine vertices around this one is known. */
+static bool known_around(const worker *w, size_t at)
+{
+    for (size_t k = 0; k < 9; k++)
+        if (w->known[at + (k / 3) * ROW + k % 3 - ROW - 1])
+            return true;
+    return false;
+}
+
+/* Every second vertex of the core, those too that took heights from their neighbours, so that coarser lattices have the
+ * same there, and what the cells between them have lost: the error of the vertex in their middle is that of the two
+ * triangles of the cell. Nothing is lost where nothing is known. */
 static tl_status fill_piece(const worker *w, out_piece *piece, tl_error *error)
 {
     piece->z = tl_alloc_grid(OUT_PIECE, OUT_PIECE, sizeof *piece->z);
@@ -344,8 +406,9 @@ static tl_status fill_piece(const worker *w, out_piece *piece, tl_error *error)
     for (int y = 0; y < OUT_PIECE; y++)
         for (int x = 0; x < OUT_PIECE; x++) {
             size_t at = (size_t)(SCENE_RIM + 2 * y) * ROW + (size_t)(SCENE_RIM + 2 * x);
-            piece->z[y * OUT_PIECE + x] = w->block.z[at];
-            piece->lost[y * OUT_PIECE + x] = w->block.errors[at + ROW + 1];
+            piece->z[y * OUT_PIECE + x] =
+                w->wide[(size_t)(SCENE_RIM + GROWTH + 2 * y) * WIDE + (size_t)(SCENE_RIM + GROWTH + 2 * x)];
+            piece->lost[y * OUT_PIECE + x] = known_around(w, at + ROW + 1) ? w->block.errors[at + ROW + 1] : 0;
         }
     return TL_OK;
 }
@@ -356,8 +419,9 @@ static tl_status begin_worker(const job *j, worker *w, tl_error *error)
     if (w->begun)
         return TL_OK;
     w->begun = true;
-    w->known = deepest ? malloc((SCENE_BLOCK + 1) * (SCENE_BLOCK + 1)) : NULL;
-    if (deepest && !w->known)
+    w->known = malloc((size_t)ROW * ROW);
+    w->wide = tl_alloc_grid(WIDE, WIDE, sizeof *w->wide);
+    if (!w->known || !w->wide)
         return tl_fail_memory(error, "a block of tiles");
     tl_status status = scene_block_init(&w->block, !deepest, error);
     if (status == TL_OK)
@@ -371,6 +435,7 @@ static void finish_worker(worker *w)
     scene_tile_mesh_finish(&w->mesh);
     out_terrain_buffer_finish(&w->buffer);
     free(w->known);
+    free(w->wide);
 }
 
 typedef struct round_of_work {
@@ -407,9 +472,15 @@ static tl_status make_block(const job *j, worker *w, const block_place *at, out_
     bool empty = false;
     tl_status status = begin_worker(j, w, error);
     if (status == TL_OK)
-        status = j->level == j->deepest ? read_heights(j, at, w, &empty, error) : gather_heights(j, at, w, error);
+        status = j->level == j->deepest ? read_heights(j, at, w, error) : gather_heights(j, at, w, error);
+    if (status == TL_OK)
+        status = take_heights(j, w, &empty, error);
+    empty = empty && j->level == j->deepest; /* the roots are always there */
     if (status == TL_OK && !empty)
         status = scene_block_measure(&w->block, error);
+    if (status == TL_OK && !empty && j->level == j->deepest)
+        status = scene_geodetic_compare(j->lattice, at->column * SCENE_BLOCK, at->row * SCENE_BLOCK, SCENE_BLOCK,
+                                        w->block.z + SCENE_RIM * ROW + SCENE_RIM, ROW, &piece->resampling, error);
     if (status == TL_OK && !empty)
         status = make_tiles(j, w, at, piece, error);
     if (status == TL_OK && !empty && j->level > ROOT_LATTICE)
@@ -460,6 +531,7 @@ static tl_status take_pieces(job *j, tl_error *error)
             level->bytes += (uint64_t)tile->bytes;
             level->error = fmax(level->error, tile->error);
         }
+        j->report.resampling = fmax(j->report.resampling, j->pieces[b].resampling);
         out_piece_finish(&j->pieces[b]);
     }
     out_tile_list_sort(&j->list);
@@ -733,7 +805,8 @@ static char *describe_layer(const job *j)
     if (j->options->attribution)
         json_object_set_new(root, "attribution", json_string(j->options->attribution));
     json_object_set_new(root, "available", describe_levels(j));
-    json_t *record = json_pack("{s:s, s:o}", "version", tl_version(), "errors", describe_errors(j));
+    json_t *record = json_pack("{s:s, s:o, s:f}", "version", tl_version(), "errors", describe_errors(j), "resampling",
+                               j->report.resampling);
     for (size_t k = 0; k < j->source->info.parameter_count; k++)
         json_object_set_new(record, j->source->info.parameters[k].name,
                             json_string(j->source->info.parameters[k].value));

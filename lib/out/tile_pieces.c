@@ -23,6 +23,7 @@ enum {
 typedef struct head {
     uint32_t magic, values_checksum;
     uint64_t tile_count, packed; /* packed: bytes of the values; 0: none */
+    double resampling;
 } head;
 
 static char *path_of(const out_piece *piece, const char *folder)
@@ -79,7 +80,7 @@ static void unpack_values(const unsigned char *from, out_piece *piece)
 static tl_status write_all(const out_piece *piece, const char *path, const unsigned char *packed, size_t count,
                            tl_error *error)
 {
-    head h = {.magic = MAGIC, .tile_count = piece->tile_count, .packed = count};
+    head h = {.magic = MAGIC, .tile_count = piece->tile_count, .packed = count, .resampling = piece->resampling};
     h.values_checksum = libdeflate_crc32(0, packed, count);
     tl_output *output = tl_output_open(path, true, error);
     if (!output)
@@ -152,6 +153,7 @@ static bool read_file(FILE *file, out_piece *piece, bool samples)
     if (fread(&h, sizeof h, 1, file) != 1 || h.magic != MAGIC || h.tile_count > MOST_TILES)
         return false;
     piece->tile_count = h.tile_count;
+    piece->resampling = h.resampling;
     piece->tiles = tl_alloc(h.tile_count, sizeof *piece->tiles);
     if (!piece->tiles || fread(piece->tiles, sizeof *piece->tiles, h.tile_count, file) != h.tile_count)
         return false;

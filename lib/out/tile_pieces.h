@@ -20,6 +20,7 @@ typedef struct out_piece_tile {
 typedef struct out_piece {
     int level; /* of the block's lattice */
     int64_t column, row;
+    double resampling; /* metres: see tl_tiles_report */
     uint64_t tile_count;
     out_piece_tile *tiles;
     float *z, *lost; /* OUT_PIECE^2 each; NULL in a piece without tiles */

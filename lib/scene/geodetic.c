@@ -255,8 +255,8 @@ static bool find_part(const tl_source_info *info, const double *at, size_t n, tl
     for (size_t k = 0; k < n; k++)
         if (covered(info, at[2 * k], at[2 * k + 1]))
             for (int a = 0; a < 2; a++) {
-                low[a] = fmin(low[a], at[2 * k + (size_t)a]);
-                high[a] = fmax(high[a], at[2 * k + (size_t)a]);
+                low[a] = at[2 * k + (size_t)a] < low[a] ? at[2 * k + (size_t)a] : low[a];
+                high[a] = at[2 * k + (size_t)a] > high[a] ? at[2 * k + (size_t)a] : high[a];
             }
     if (!(low[0] <= high[0]))
         return false;
@@ -395,5 +395,117 @@ tl_status scene_geodetic_read(const scene_geodetic *g, tl_window window, float *
                           window.width};
             status = read_patch(g, &here, error);
         }
+    return status;
+}
+
+/* ---- Comparing ---- */
+
+typedef struct comparison {
+    const scene_geodetic *g;
+    int64_t x, y;
+    int cells;
+    const float *z;
+    int64_t stride;
+    double worst;
+} comparison;
+
+/* The surface at (u, v) cells from the first vertex; the diagonals of the smallest squares meet at their odd vertices.
+ */
+static double surface(const comparison *c, double u, double v)
+{
+    int64_t i = clamp((int64_t)u, c->cells), j = clamp((int64_t)v, c->cells);
+    double fu = u - (double)i, fv = v - (double)j;
+    const float *z = c->z + j * c->stride + i;
+    double sw = (double)z[0], se = (double)z[1], nw = (double)z[c->stride], ne = (double)z[c->stride + 1];
+    if (((c->x + i) ^ (c->y + j)) & 1) /* the diagonal falls to the south-east */
+        return fu + fv <= 1 ? sw + fu * (se - sw) + fv * (nw - sw) : ne + (1 - fu) * (nw - ne) + (1 - fv) * (se - ne);
+    return fu >= fv ? sw + fu * (se - sw) + fv * (ne - se) : sw + fv * (nw - sw) + fu * (ne - nw);
+}
+
+/* A row of samples, of whose every `step`-th the place is known, in degrees. */
+static void compare_row(comparison *c, const float *row, const double *longitude, const double *latitude, int64_t count,
+                        int64_t step)
+{
+    const scene_geodetic *g = c->g;
+    double unit = g->source->info.georef.height_unit, per_degree = 1 / scene_geodetic_step(g->level);
+    double around = (double)scene_geodetic_columns(g->level), middle = (double)c->x + 0.5 * c->cells;
+    for (int64_t k = 0; k < count; k += step) {
+        double u = (longitude[k / step] + g->meridian + 180) * per_degree, v = (latitude[k / step] + 90) * per_degree;
+        u -= around * rint((u - middle) / around);
+        u -= (double)c->x, v -= (double)c->y;
+        if (!(u >= 0 && v >= 0 && u <= c->cells && v <= c->cells) || !isfinite(row[k]))
+            continue;
+        double off = fabs(surface(c, u, v) - (double)row[k] * unit);
+        c->worst = off > c->worst ? off : c->worst;
+    }
+}
+
+/* The samples under the block, by places all over it; false: none. */
+static bool find_samples(const comparison *c, tl_window *out)
+{
+    enum { SIDE = 33 };
+    const scene_geodetic *g = c->g;
+    double at[2 * SIDE * SIDE], i[SIDE], j[SIDE];
+    for (int row = 0; row < SIDE; row++) {
+        for (int k = 0; k < SIDE; k++) {
+            i[k] = (double)c->x + (double)c->cells * k / (SIDE - 1);
+            j[k] = (double)c->y + (double)c->cells * row / (SIDE - 1);
+            if (g->grid) { /* nothing is known beyond its window */
+                i[k] = fmin(fmax(i[k], (double)g->window.x), (double)(g->window.x + g->window.width - 1));
+                j[k] = fmin(fmax(j[k], (double)g->window.y), (double)(g->window.y + g->window.height - 1));
+            }
+        }
+        find_positions(g, SIDE, i, j, at + 2 * SIDE * row);
+    }
+    for (int k = 0; k < 2 * SIDE * SIDE; k++) { /* to the raster, as its rim may lie between two of the places */
+        int64_t size = k % 2 ? g->source->info.height : g->source->info.width;
+        if (k % 2 || !g->source->info.wraps)
+            at[k] = fmin(fmax(at[k], 0), (double)(size - 1));
+    }
+    return find_part(&g->source->info, at, SIDE * SIDE, out);
+}
+
+/* Places of every `step`-th sample of a row, in degrees. */
+static tl_status find_degrees(const scene_geodetic *g, tl_window w, int64_t step, double *longitude, double *latitude,
+                              tl_error *error)
+{
+    const tl_georef *georef = &g->source->info.georef;
+    const double *t = georef->transform;
+    size_t count = 0;
+    for (int64_t k = 0; k < w.width; k += step, count++) {
+        double i = (double)(w.x + k), j = (double)w.y;
+        longitude[count] = g->projection ? i : t[0] + t[1] * i + t[2] * j;
+        latitude[count] = g->projection ? j : t[3] + t[4] * i + t[5] * j;
+    }
+    return g->projection ? tl_georef_to_lonlat(georef, count, longitude, latitude, error) : TL_OK;
+}
+
+tl_status scene_geodetic_compare(const scene_geodetic *g, int64_t x, int64_t y, int cells, const float *z,
+                                 int64_t stride, double *worst, tl_error *error)
+{
+    comparison c = {g, x, y, cells, z, stride, 0};
+    const tl_source_info *info = &g->source->info;
+    int64_t step = g->projection ? 4 : 1;
+    tl_window w;
+    *worst = 0;
+    if (!find_samples(&c, &w))
+        return TL_OK;
+    w.width = tl_int64_min(w.width, info->width);
+    double *longitude = tl_alloc((size_t)w.width, sizeof *longitude);
+    double *latitude = tl_alloc((size_t)w.width, sizeof *latitude);
+    part row = {.z = tl_alloc((size_t)w.width, sizeof *row.z)};
+    tl_status status = longitude && latitude && row.z ? TL_OK : tl_fail_memory(error, info->name);
+    for (int64_t line = 0; line < w.height && status == TL_OK; line += step) {
+        row.window = (tl_window){w.x, w.y + line, w.width, 1};
+        status = read_part(g->source, &row, error);
+        if (status == TL_OK)
+            status = find_degrees(g, row.window, step, longitude, latitude, error);
+        if (status == TL_OK)
+            compare_row(&c, row.z, longitude, latitude, w.width, step);
+    }
+    *worst = c.worst;
+    free(row.z);
+    free(longitude);
+    free(latitude);
     return status;
 }

@@ -163,7 +163,11 @@ static void draw_triangle(const drawing *d, place a, place b, place c, int size)
             draw_triangle(d, middle, c, a, size - 1);
             return;
         }
-        mesh->error = fmax(mesh->error, error);
+        mesh->error = error > mesh->error ? error : mesh->error;
+    } else if (d->block->lost) {                                  /* half a cell, of which finer lattices know more */
+        int x = (a.i + b.i + c.i) / 3, y = (a.j + b.j + c.j) / 3; /* rounds down into it */
+        double lost = (double)d->block->lost[(size_t)(d->y + y) * SIDE + (size_t)(d->x + x)];
+        mesh->lost = lost > mesh->lost ? lost : mesh->lost;
     }
     uint32_t *corner = mesh->indices + 3 * mesh->triangle_count++;
     corner[0] = number_of(d, a);
@@ -177,7 +181,7 @@ void scene_tile_draw(const scene_block *block, int x, int y, int cells, const do
     const drawing d = {block, x, y, limits, mesh};
     mesh->cells = cells;
     mesh->vertex_count = mesh->triangle_count = 0;
-    mesh->error = 0;
+    mesh->error = mesh->lost = 0;
     memset(mesh->numbers, 0xff, (size_t)(cells + 1) * (size_t)(cells + 1) * sizeof *mesh->numbers);
     int size = cells > 1 ? tl_size_of(cells / 2, true) : 0;
     const place sw = {0, 0}, se = {cells, 0}, ne = {cells, cells}, nw = {0, cells};

@@ -43,7 +43,8 @@ typedef struct scene_tile_mesh {
         float z;
     } * vertices;
     uint32_t *indices;
-    double error;     /* a bound of what was left out, against all finer samples; without that of `limits` */
+    double error;     /* of the vertices that were left out, the greatest */
+    double lost;      /* of the cells that are drawn in full, the most that they have lost */
     int32_t *numbers; /* of the vertices that are taken, by place; -1 */
 } scene_tile_mesh;
 
