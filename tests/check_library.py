@@ -93,13 +93,13 @@ def installed_program(folder):
     environment["LD_LIBRARY_PATH"] = libraries
     program = os.path.join(folder, "api_synth")
     run(*CC, "-std=c11", *STRICT, os.path.join(SOURCE, "examples", "api_synth.c"), "-o", program, *flags)
-    said = run(program, os.path.join(SOURCE, "examples", "jacksboro.tif"), os.path.join(folder, "a.exr"), "2",
+    said = run(program, os.path.join(SOURCE, "examples", "jacksboro.tif"), os.path.join(folder, "a.raw"), "2",
                env=environment)
     assert said == f"talus {version}: 1612 x 1376 samples\n", said
     talus = os.path.join(destination, next(name for name in files if name.endswith("bin/talus")))
-    run(talus, "synth", os.path.join(SOURCE, "examples", "jacksboro.tif"), "-l", 2, "-q", "-o", "b.exr", env=environment,
+    run(talus, "synth", os.path.join(SOURCE, "examples", "jacksboro.tif"), "-l", 2, "-q", "-o", "b.raw", env=environment,
         cwd=folder)
-    with open(os.path.join(folder, "a.exr"), "rb") as a, open(os.path.join(folder, "b.exr"), "rb") as b:
+    with open(os.path.join(folder, "a.raw"), "rb") as a, open(os.path.join(folder, "b.raw"), "rb") as b:
         assert a.read() == b.read(), "the library and the program make different files"
     said = run(program, "absent.tif", "c.exr", "2", fails=True, env=environment, cwd=folder)
     assert said == "absent.tif: cannot read: No such file or directory\n", said
