@@ -6,9 +6,9 @@
 #include <string.h>
 #include <unistd.h>
 
-static const command *const commands[] = {&command_info,    &command_simplify, &command_synth,
-                                          &command_preview, &command_noise,    &command_stats,
-                                          &command_view,    &command_fly,      &command_tiles};
+static const command *const commands[] = {&command_info,  &command_simplify, &command_synth, &command_preview,
+                                          &command_noise, &command_stats,    &command_view,  &command_fly,
+                                          &command_tiles, &command_serve};
 enum { COMMAND_COUNT = sizeof commands / sizeof *commands };
 
 static const command *find(const char *name)

@@ -5,6 +5,7 @@
 """
 import array
 import hashlib
+import http.client
 import json
 import math
 import os
@@ -947,6 +948,47 @@ def layers_are_refused_before_the_work(case):
 
 # ---- the manuals ----
 
+def ask(port, path, method="GET", **headers):
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
+    connection.request(method, path, body=b"x" * 70000 if method == "POST" else None, headers=headers)
+    answer = connection.getresponse()
+    found = (answer.status, answer.getheader("Content-Encoding"), answer.read())
+    connection.close()
+    return found
+
+
+def serves_the_folder_alone(case):
+    """serve gives files of the folder to this machine: nothing beside it, by dots or links, and nothing to pages of other sites."""
+    os.makedirs(case.path("site/0"))
+    for name, text in (("site/layer.json", "{}"), ("site/0/0.terrain", "packed"), ("secret", "no"), ("site2", "no")):
+        with open(case.path(name), "w", encoding="ascii") as file:
+            file.write(text)
+    os.symlink(case.path("secret"), case.path("site/link"))
+    os.symlink("layer.json", case.path("site/inner"))
+    server = subprocess.Popen([case.program, "serve", "site", "--port", "0"], cwd=case.folder, stdout=subprocess.PIPE,
+                              stderr=subprocess.DEVNULL)
+    try:
+        first = server.stdout.readline().decode()
+        if not first:
+            raise Skip("built without libmicrohttpd")
+        port = int(re.fullmatch(r"http://127\.0\.0\.1:(\d+)/\n", first).group(1))
+        expect(ask(port, "/layer.json") == (200, None, b"{}"), "a file")
+        expect(ask(port, "/inner") == (200, None, b"{}"), "a link within the folder")
+        expect(ask(port, "/0/0.terrain") == (200, "gzip", b"packed"), "a tile")
+        expect(ask(port, "/layer.json", "HEAD") == (200, None, b""), "HEAD")
+        for path in ("/../secret", "/..%2fsecret", "/0/../../secret", "/link", "/0", "/%00", "/" + "a" * 5000, "/../site2"):
+            expect(ask(port, path)[0] == 404, f"{path}: {ask(port, path)}")
+        expect(ask(port, "/layer.json", "POST")[0] == 405, "POST")
+        expect(ask(port, "/layer.json", Host="example.org")[0] == 403, "another name for this machine")
+        server.send_signal(signal.SIGTERM)
+        expect(server.wait(20) == 0, "ended by a signal")
+    finally:
+        server.kill()
+        server.wait()
+        server.stdout.close()
+    expect("no such folder" in case.run("serve", "absent", status=1).err, "a folder that is not there")
+
+
 def commands_in_readme():
     with open(os.path.join(ROOT, "README.md"), encoding="utf-8") as file:
         text = file.read()
@@ -1137,7 +1179,7 @@ TESTS = [
     bar_only_on_a_terminal, progress_lines_are_json, quiet_is_silent,
     json_keeps_its_schema, statistics_keep_their_schema, real_files_keep_the_schema, window_costs_its_blocks, a_part_is_that_part, corners_agree_with_gdal,
     names_of_any_bytes,
-    formats_hold_the_same_heights, outputs_are_read_back, sidecars_are_checked, outputs_are_made_again, png_within_half_a_step, point_samples_are_kept, point_samples_of_the_andes_are_kept,
+    serves_the_folder_alone, formats_hold_the_same_heights, outputs_are_read_back, sidecars_are_checked, outputs_are_made_again, png_within_half_a_step, point_samples_are_kept, point_samples_of_the_andes_are_kept,
     area_means_stay_on_their_footprint,
     glb_is_in_metres, frames_agree, simplify_keeps_its_word, diagonals_are_turned, codings_keep_the_bound, layers_are_written_beside, inputs_are_not_overwritten, layers_are_refused_before_the_work, vertices_tell_where_they_came_from,
     flights_tell_how_far_ground_jumps, pictures_take_colours_of_rasters,
