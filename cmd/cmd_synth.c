@@ -671,7 +671,7 @@ static int run_synth(const command *self, int argc, const char **argv, bool help
     const option output[] = {GRID_OUTPUT(set),
                              {"layers", 0, OPTION_TEXT, &set.layers, NULL, "KINDS",
                               "write these beside the heights, with commas between: normal, tangent, slope, curvature, "
-                              "splat, colour, albedo, sigma",
+                              "splat, colour, albedo, sigma, hurst, mask",
                               0, 0, NULL},
                              {"layer-format", 0, OPTION_CHOICE, &set.layer_format, NULL, "FORMAT",
                               "of the layers (default: exr)", 0, 0, layer_formats},

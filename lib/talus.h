@@ -779,7 +779,7 @@ typedef struct tl_lod_stats {
     uint64_t samples_made;
     uint64_t dem_blocks, dem_samples; /* blocks of the DEM that were read, and samples of windows of it */
     int finest_level;
-    double pixel_error; /* the largest that is left, by the bounds used; infinite at distance 0 */
+    double pixel_error;  /* the largest that is left, by the bounds used; infinite at distance 0 */
     double above_ground; /* metres of the eye above the DEM; NaN where that has none */
     double seconds;
 } tl_lod_stats;
@@ -817,8 +817,8 @@ typedef struct tl_view_picture_options {
     double haze;                       /* metres at which half of the light is lost in the air; 0: clear */
     double exaggeration;               /* factor on the mesh's heights, not on the eye's, 0 ... 1e6; 0: 1 */
     bool grey;                         /* no colours by height */
-    /* A raster in dem's CRS that is laid over the mesh: bands of red, green and blue bytes, or one of grey. Where it has
-     * none, and where this is NULL: colours by height. Far ground has the means of what a pixel covers. */
+    /* A raster in dem's CRS that is laid over the mesh: bands of red, green and blue bytes, or one of grey. Where it
+     * has none, and where this is NULL: colours by height. Far ground has the means of what a pixel covers. */
     const char *colour;
     bool facets; /* light each triangle by itself; else by normals at its corners, means over the triangles
                     around weighted by their areas, so that no triangle shows */
@@ -1135,8 +1135,9 @@ typedef struct tl_layer_options {
  * for sigma over heights that tl_field_create did not make. */
 TL_API tl_source *tl_layer_create(const tl_source *heights, const char *kind, size_t channel,
                                   const tl_layer_options *options, tl_error *error);
-/* Writes a layer: .exr with its channels; .png with 8 bits (normals from -1 ... 1, slopes from 0 ... 90 degrees,
- * shares, sRGB; not curvature and sigma); .tif where it has one channel. Pictures have the north in their first row. */
+/* Writes a layer: .exr with its channels; .png with 8 bits (normals from -1 ... 1, slopes from 0 ... 90 degrees, mask
+ * and hurst from 0 ... 1, shares, sRGB; not curvature and sigma); .tif where it has one channel. Pictures have the
+ * north in their first row. */
 TL_API tl_status tl_write_layer(const tl_source *heights, const char *kind, const char *path,
                                 const tl_layer_options *options, tl_error *error);
 

@@ -108,8 +108,8 @@ static void windowsJoin(void **state)
     tl_source *source = make(waves, 1, heights);
     heights[20 * WIDTH + 20] = NAN;
     for (const tl_layer_kind *kind = tl_layers(); kind->name; kind++) {
-        if (strcmp(kind->name, "sigma") == 0)
-            continue;
+        if (strcmp(kind->name, "sigma") == 0 || strcmp(kind->name, "hurst") == 0 || strcmp(kind->name, "mask") == 0)
+            continue; /* of fields, and one that voids have too: below */
         float *all = read_layer(source, kind->name, NULL, whole);
         assert_true(isnan(all[20 * WIDTH + 20]) && !isnan(all[20 * WIDTH + 21]));
         for (int y = 0; y < HEIGHT; y += 16)
@@ -213,6 +213,45 @@ static void wrongRulesAreTold(void **state)
     tl_source_destroy(source);
 }
 
+/* Exponents of a map, at the places of the finer lattice. */
+static void hurstIsThatOfTheMap(void **state)
+{
+    (void)state;
+    static float heights[WIDTH * HEIGHT], exponents[WIDTH * HEIGHT];
+    tl_source *source = make(waves, 1, heights), *map = make(waves, 1, exponents);
+    for (int k = 0; k < WIDTH * HEIGHT; k++)
+        exponents[k] = 0.2f + 0.6f * (float)(k % WIDTH) / (WIDTH - 1);
+    tl_field_options options = {
+        .levels = 1, .hurst_map = map, .delta_given = true, .delta = 4, .support = TL_SUPPORT_POINT};
+    tl_source *field = tl_field_create(source, &options, NULL);
+    assert_non_null(field);
+    float *hurst = read_layer(field, "hurst", NULL, (tl_window){10, 5, 40, 30});
+    for (int k = 0; k < 40 * 30; k++)
+        assert_near((double)hurst[k], 0.2 + 0.6 * (10 + k % 40) / 2.0 / (WIDTH - 1), 1e-5);
+    free(hurst);
+    tl_source_destroy(field);
+    tl_source_destroy(map);
+    tl_source_destroy(source);
+}
+
+/* Voids are 0, and what was filled is a half. */
+static void masksTellWhatIsKnown(void **state)
+{
+    (void)state;
+    static float heights[WIDTH * HEIGHT];
+    tl_source *source = make(waves, 1, heights);
+    heights[20 * WIDTH + 20] = NAN;
+    tl_source *filled = tl_voids_create(source, &(tl_void_options){.rule = TL_VOIDS_FILL}, NULL);
+    for (int kind = 0; kind < 2; kind++) {
+        float *mask = read_layer(kind ? filled : source, "mask", NULL, whole);
+        for (int k = 0; k < WIDTH * HEIGHT; k++)
+            assert_true((double)mask[k] == (k != 20 * WIDTH + 20 ? 1 : kind ? 0.5 : 0));
+        free(mask);
+    }
+    tl_source_destroy(filled);
+    tl_source_destroy(source);
+}
+
 /* As strong as the place is rough: delta of the model where the strength is one. */
 static void sigmaIsThatOfTheField(void **state)
 {
@@ -226,6 +265,10 @@ static void sigmaIsThatOfTheField(void **state)
     for (int k = 0; k < 40 * 30; k++)
         assert_near((double)sigma[k], 4 * pow(0.25, 0.5), 1e-5); /* over a quarter of the spacing */
     free(sigma);
+    float *hurst = read_layer(field, "hurst", NULL, (tl_window){3, 5, 40, 30});
+    for (int k = 0; k < 40 * 30; k++)
+        assert_near((double)hurst[k], 0.5, 1e-6);
+    free(hurst);
     tl_source_destroy(field);
     tl_source_destroy(source);
 }
@@ -240,6 +283,8 @@ int main(void)
         cmocka_unit_test(rulesShareTheGround),
         cmocka_unit_test(wrongRulesAreTold),
         cmocka_unit_test(sigmaIsThatOfTheField),
+        cmocka_unit_test(hurstIsThatOfTheMap),
+        cmocka_unit_test(masksTellWhatIsKnown),
     };
     return cmocka_run_group_tests_name("layers", tests, NULL, NULL);
 }

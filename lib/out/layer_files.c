@@ -89,13 +89,23 @@ tl_source *tl_layer_create(const tl_source *heights, const char *kind, size_t ch
 /* ---- PNG ---- */
 
 typedef struct painted {
+    const tl_layer_kind *kind;
     const scene_layer *layer;
+    const tl_source *channel; /* where `layer` is NULL: the only one */
     int64_t width;
 } painted;
 
 static unsigned char byte_of(double value)
 {
     return (unsigned char)(value > 1 ? 255 : value > 0 ? value * 255 + 0.5 : 0);
+}
+
+/* What 8 bits of a channel go up to, from 0; 0: there is no such range. */
+static double range_of(const tl_layer_kind *kind)
+{
+    if (strcmp(kind->name, "slope") == 0)
+        return 90;
+    return kind->channels > 1 || strcmp(kind->name, "mask") == 0 || strcmp(kind->name, "hurst") == 0;
 }
 
 void out_layer_paint(const tl_layer_kind *kind, const float *values, size_t stride, unsigned char out[4])
@@ -110,7 +120,7 @@ void out_layer_paint(const tl_layer_kind *kind, const float *values, size_t stri
         out[c] = colours ? scene_encode(values[c * stride])
                          : byte_of(shares                ? v
                                    : kind->channels == 3 ? (v + 1) / 2
-                                                         : v / 90);
+                                                         : v / range_of(kind));
     }
     if (kind->channels == 1)
         out[1] = out[2] = out[0];
@@ -119,30 +129,37 @@ void out_layer_paint(const tl_layer_kind *kind, const float *values, size_t stri
 static tl_status paint_rows(void *context, int64_t y, int64_t count, unsigned char *rgba, tl_error *error)
 {
     const painted *self = context;
-    const tl_layer_kind *kind = scene_layer_kind(self->layer);
+    const tl_window window = {0, y, self->width, count};
     size_t samples = (size_t)(count * self->width);
-    float *values = tl_alloc(kind->channels * samples, sizeof *values);
-    tl_status status = values ? scene_layer_read(self->layer, (tl_window){0, y, self->width, count}, values, error)
-                              : tl_fail_memory(error, "a layer's rows");
+    float *values = tl_alloc(self->kind->channels * samples, sizeof *values);
+    tl_status status = !values       ? tl_fail_memory(error, "a layer's rows")
+                       : self->layer ? scene_layer_read(self->layer, window, values, error)
+                                     : tl_source_read(self->channel, self->channel->info.level, window, values, error);
     for (size_t k = 0; status == TL_OK && k < samples; k++)
-        out_layer_paint(kind, values + k, samples, rgba + 4 * k);
+        out_layer_paint(self->kind, values + k, samples, rgba + 4 * k);
     free(values);
     return status;
+}
+
+static tl_status paint(const tl_source *heights, painted *context, tl_output *output, const tl_run *run,
+                       tl_error *error)
+{
+    context->width = heights->info.width;
+    scene_picture picture = {
+        .width = heights->info.width, .height = heights->info.height, .context = context, .rows = paint_rows};
+    if (range_of(context->kind) == 0)
+        return tl_fail(error, TL_ERROR_ARGUMENT, "%s: %s has no range for 8 bits; write it as .exr or .tif",
+                       tl_output_path(output), context->kind->name);
+    tl_status status = scene_picture_check(picture.width, picture.height, error);
+    scene_encode_prepare();
+    return status == TL_OK ? out_picture_write(&picture, output, run, error) : status;
 }
 
 static tl_status write_png(const tl_source *heights, const scene_layer *layer, tl_output *output, const tl_run *run,
                            tl_error *error)
 {
-    painted context = {layer, heights->info.width};
-    scene_picture picture = {
-        .width = heights->info.width, .height = heights->info.height, .context = &context, .rows = paint_rows};
-    const tl_layer_kind *kind = scene_layer_kind(layer);
-    if (kind->channels == 1 && strcmp(kind->name, "slope") != 0)
-        return tl_fail(error, TL_ERROR_ARGUMENT, "%s: %s has no range for 8 bits; write it as .exr or .tif",
-                       tl_output_path(output), kind->name);
-    tl_status status = scene_picture_check(picture.width, picture.height, error);
-    scene_encode_prepare();
-    return status == TL_OK ? out_picture_write(&picture, output, run, error) : status;
+    painted context = {.kind = scene_layer_kind(layer), .layer = layer};
+    return paint(heights, &context, output, run, error);
 }
 
 /* ---- EXR ---- */
@@ -217,6 +234,27 @@ static bool is_upright(const double *t)
     return t[2] != 0 || t[4] != 0 || (t[1] > 0 && t[5] < 0);
 }
 
+/* Of one channel, as a picture: the layer is turned, and not the heights, which then would not be the field any more.
+ */
+static tl_status write_grey(const tl_source *heights, const char *kind, const char *path,
+                            const tl_layer_options *options, tl_error *error)
+{
+    tl_source *layer = tl_layer_create(heights, kind, 0, options, error);
+    tl_source *upright = layer ? scene_north_up(layer, error) : NULL;
+    tl_output *output = upright ? tl_output_open(path, options->overwrite, error) : NULL;
+    tl_status status = output ? TL_OK : upright ? TL_ERROR_IO : layer ? TL_ERROR_MEMORY : TL_ERROR_ARGUMENT;
+    painted context = {.kind = kind_of(kind), .channel = upright};
+    if (status == TL_OK)
+        status = paint(upright, &context, output, options->run, error);
+    if (status == TL_OK)
+        status = tl_output_commit(output, error);
+    else
+        tl_output_abort(output);
+    tl_source_destroy(upright);
+    tl_source_destroy(layer);
+    return status;
+}
+
 tl_status tl_write_layer(const tl_source *heights, const char *kind, const char *path, const tl_layer_options *options,
                          tl_error *error)
 {
@@ -230,6 +268,8 @@ tl_status tl_write_layer(const tl_source *heights, const char *kind, const char 
                        "%s: layers are written as .exr or .png, and those of one value a sample as .tif", path);
     if (!picture && found && found->channels == 1)
         return write_scalar(heights, kind, path, options, error);
+    if (found && found->channels == 1)
+        return write_grey(heights, kind, path, options, error);
     if (is_upright(heights->info.georef.transform))
         return write_channels(heights, kind, path, options, error);
     tl_source *upright = scene_north_up(heights, error);

@@ -604,6 +604,23 @@ tl_status scene_field_strengths(const tl_source *source, tl_window window, float
     return status;
 }
 
+tl_status scene_field_hursts(const tl_source *source, tl_window window, float *out, tl_error *error)
+{
+    const field *f = as_field(source);
+    size_t count = (size_t)(window.width * window.height);
+    for (size_t k = 0; k < count; k++)
+        out[k] = (float)f->hursts[f->source.info.level];
+    if (!f->chain.placed)
+        return TL_OK;
+    ground g;
+    fbm_window from = {window.x, window.y, (size_t)window.width, (size_t)window.height, (size_t)window.width};
+    tl_status status = ground_read(f, from, &g, error);
+    if (status == TL_OK)
+        memcpy(out, g.planes.of[SCENE_HURST], count * sizeof *out);
+    ground_free(&g);
+    return status;
+}
+
 tl_window scene_field_support(const tl_source *source, int level, tl_window window)
 {
     const field *f = as_field(source);

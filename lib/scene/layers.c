@@ -20,6 +20,7 @@ typedef struct spot {
     double east, north; /* slopes along rows, and against columns as rows run: metres up a metre */
     double curvature;   /* mean curvature, 1 / metre: above 0 in hollows, below 0 on ridges */
     double sigma;       /* NaN where it is not asked for */
+    double hurst;       /* likewise */
 } spot;
 
 typedef void (*maker)(const scene_layer *, const spot *, float *out);
@@ -28,7 +29,7 @@ struct scene_layer {
     const tl_layer_kind *kind;
     maker make;
     const tl_source *heights;
-    bool needs_sigma;
+    bool needs_sigma, needs_hurst;
     double axes[2][2]; /* unit vectors of columns and of rows in the CRS's plane, east and north */
     double sigma;      /* of the whole field, metres over one sample */
     scene_light light;
@@ -115,6 +116,20 @@ static void make_albedo(const scene_layer *layer, const spot *at, float *out)
     out[0] = c.r, out[1] = c.g, out[2] = c.b;
 }
 
+static void make_hurst(const scene_layer *layer, const spot *at, float *out)
+{
+    (void)layer;
+    *out = (float)at->hurst;
+}
+
+/* Made from the validity, which voids have too: see scene_layer_read. */
+static void make_mask(const scene_layer *layer, const spot *at, float *out)
+{
+    (void)layer;
+    (void)at;
+    *out = 1;
+}
+
 static const tl_layer_kind kinds[] = {
     {"normal", "unit normals: east, north, up", 3, {"R", "G", "B"}},
     {"tangent", "unit normals in the picture's own axes: right, up, out of it", 3, {"R", "G", "B"}},
@@ -127,12 +142,14 @@ static const tl_layer_kind kinds[] = {
      "standard deviation of the detail's height difference over one sample, in metres (--support point)",
      1,
      {"sigma"}},
+    {"hurst", "Hurst exponent of the finest detail", 1, {"hurst"}},
+    {"mask", "1 where the height is known, 0.5 where it was filled, 0 in voids", 1, {"mask"}},
     {NULL, NULL, 0, {NULL}},
 };
 
 /* In the order of `kinds`. */
-static const maker makers[] = {make_normal, make_tangent, make_slope,  make_curvature,
-                               make_splat,  make_colour,  make_albedo, make_sigma};
+static const maker makers[] = {make_normal, make_tangent, make_slope, make_curvature, make_splat,
+                               make_colour, make_albedo,  make_sigma, make_hurst,     make_mask};
 
 const tl_layer_kind *tl_layers(void)
 {
@@ -215,7 +232,8 @@ static spot spot_at(const scene_layer *layer, const patch *p, int64_t x, int64_t
     spot at = {.z = z / layer->heights->info.georef.height_unit,
                .east = slope_of(west, z, east, dx),
                .north = slope_of(down, z, up, dy),
-               .sigma = layer->needs_sigma ? layer->sigma * strength_at(p, x, y) : (double)NAN};
+               .sigma = layer->needs_sigma ? layer->sigma * strength_at(p, x, y) : (double)NAN,
+               .hurst = layer->needs_hurst ? strength_at(p, x, y) : (double)NAN};
     at.curvature = curvature_of(at.east, at.north, bend_of(west, z, east, dx), isnan(cross) ? 0 : cross / (4 * dx * dy),
                                 bend_of(up, z, down, dy));
     return at;
@@ -225,7 +243,7 @@ static spot spot_at(const scene_layer *layer, const patch *p, int64_t x, int64_t
 
 static tl_status read_strengths(const scene_layer *layer, patch *p, tl_error *error)
 {
-    if (!layer->needs_sigma || !scene_field_dem(layer->heights))
+    if (!(layer->needs_sigma || layer->needs_hurst) || !scene_field_dem(layer->heights))
         return TL_OK;
     tl_window w = p->window, *m = &p->model;
     p->level = layer->heights->info.level;
@@ -236,7 +254,7 @@ static tl_status read_strengths(const scene_layer *layer, patch *p, tl_error *er
     p->strengths = tl_alloc_grid(m->width, m->height, sizeof *p->strengths);
     if (!p->strengths)
         return tl_fail_memory(error, layer->heights->info.name);
-    return scene_field_strengths(layer->heights, *m, p->strengths, error);
+    return (layer->needs_hurst ? scene_field_hursts : scene_field_strengths)(layer->heights, *m, p->strengths, error);
 }
 
 static tl_status read_heights(const scene_layer *layer, patch *p, tl_error *error)
@@ -261,8 +279,22 @@ static tl_status read_heights(const scene_layer *layer, patch *p, tl_error *erro
     return status;
 }
 
+static tl_status read_mask(const scene_layer *layer, tl_window window, float *out, tl_error *error)
+{
+    size_t samples = (size_t)(window.width * window.height);
+    unsigned char *known = tl_alloc(samples, 1);
+    tl_status status = known ? tl_source_validity(layer->heights, layer->heights->info.level, window, known, error)
+                             : tl_fail_memory(error, layer->heights->info.name);
+    for (size_t k = 0; status == TL_OK && k < samples; k++)
+        out[k] = known[k] == TL_MEASURED ? 1.0f : known[k] == TL_FILLED ? 0.5f : 0.0f;
+    free(known);
+    return status;
+}
+
 tl_status scene_layer_read(const scene_layer *layer, tl_window window, float *out, tl_error *error)
 {
+    if (layer->make == make_mask)
+        return read_mask(layer, window, out, error);
     patch p = {.window = window};
     size_t channels = layer->kind->channels, samples = (size_t)(window.width * window.height);
     tl_status status = read_heights(layer, &p, error);
@@ -331,13 +363,22 @@ static tl_status find_sigma(scene_layer *layer, tl_error *error)
     return TL_OK;
 }
 
+static tl_status check_hurst(const scene_layer *layer, tl_error *error)
+{
+    const tl_source *s = layer->heights;
+    return scene_field_dem(s) ? TL_OK
+                              : tl_fail(error, TL_ERROR_ARGUMENT,
+                                        "%s: has no fractal detail; hurst is a layer of fields", s->info.name);
+}
+
 static tl_status prepare(scene_layer *layer, const tl_layer_options *options, const tl_source *colours_of,
                          tl_error *error)
 {
     find_axes(layer);
     scene_light_init(&layer->light, 315, 45);
     layer->needs_sigma = layer->make == make_sigma;
-    tl_status status = TL_OK;
+    layer->needs_hurst = layer->make == make_hurst;
+    tl_status status = layer->needs_hurst ? check_hurst(layer, error) : TL_OK;
     if (layer->make == make_splat) {
         status = layer_rules_read(options ? options->rules : NULL, &layer->rules, error);
         layer->needs_sigma = status == TL_OK && layer_rules_use(&layer->rules, LAYER_SIGMA);
@@ -357,7 +398,8 @@ static scene_layer *create(const tl_source *heights, const char *kind, const tl_
         k++;
     if (!kinds[k].name) {
         tl_fail(error, TL_ERROR_ARGUMENT,
-                "no layer '%.60s'; use normal, tangent, slope, curvature, splat, colour, albedo or sigma", kind);
+                "no layer '%.60s'; use normal, tangent, slope, curvature, splat, colour, albedo, sigma, hurst or mask",
+                kind);
         return NULL;
     }
     scene_layer *layer = calloc(1, sizeof *layer);
