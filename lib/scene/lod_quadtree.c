@@ -18,7 +18,7 @@ typedef struct search {
     lod_list *leaves;
     lod_list hidden;  /* lod_leaf: by rules that are switched off; by depth */
     size_t taken;     /* of these, in the second pass */
-    uint64_t *seen;   /* keys of the middles of leaves that are not split, by open addressing; NULL in the first pass */
+    uint64_t *seen;   /* keys of the middles of what the first pass draws, by open addressing; NULL in that pass */
     size_t seen_room; /* a power of two */
     unsigned rules;
     int depth;
@@ -97,34 +97,61 @@ static size_t seen_slot(const search *self, uint64_t key)
     return at;
 }
 
-/* Notes the middles of all leaves that are not split for another. */
+/* Notes the middles of all that is drawn of a leaf, which may be split for others. */
+static void note_leaf(search *self, const lod_triangle *t, int depth, const scene_tile **last)
+{
+    int32_t x, y;
+    uint32_t middle = lod_splitter(self->l, t, depth, last);
+    if (middle != LOD_NONE) {
+        note_leaf(self, &(lod_triangle){t->apex, t->a, middle, 0, 0}, depth + 1, last);
+        note_leaf(self, &(lod_triangle){t->b, t->apex, middle, 0, 0}, depth + 1, last);
+    } else if (depth < 2 * self->l->lattice_log) {
+        lod_middle(self->l, t, &x, &y);
+        self->seen[seen_slot(self, vertex_key(x, y))] = vertex_key(x, y);
+    }
+}
+
+/* Leaves are drawn as so many triangles at most as there are leaves and vertices. */
 static tl_status note_seen(search *self, tl_error *error)
 {
     const scene_tile *last = NULL;
     const lod_leaf *leaves = self->leaves->items;
-    for (self->seen_room = 1024; self->seen_room < 2 * self->leaves->count;)
+    for (self->seen_room = 1024; self->seen_room < 2 * (self->leaves->count + 2 * self->l->vertices.count);)
         self->seen_room *= 2;
     self->seen = calloc(self->seen_room, sizeof *self->seen);
     if (!self->seen)
         return tl_fail_memory(error, "the view's triangles");
-    for (size_t k = 0; k < self->leaves->count; k++) {
-        int32_t x, y;
-        lod_middle(self->l, &leaves[k].triangle, &x, &y);
-        if (leaves[k].depth < 2 * self->l->lattice_log &&
-            lod_splitter(self->l, &leaves[k].triangle, leaves[k].depth, &last) == LOD_NONE)
-            self->seen[seen_slot(self, vertex_key(x, y))] = vertex_key(x, y);
-    }
+    for (size_t k = 0; k < self->leaves->count; k++)
+        note_leaf(self, &leaves[k].triangle, leaves[k].depth, &last);
     return TL_OK;
 }
 
-/* Whether marking a vertex, and all that it needs, splits no leaf of the first pass. */
+static bool is_seen(const search *self, int32_t x, int32_t y)
+{
+    return self->seen[seen_slot(self, vertex_key(x, y))] != 0;
+}
+
+/* Whether a vertex is on the side of a cell of the model that is seen and not split. Where a corner of it is void it
+ * cannot be split, and its halves are drawn with all vertices on its sides. */
+static bool beside_seen_cell(const search *self, int32_t x, int32_t y)
+{
+    int32_t cell = self->l->cell, half = cell / 2;
+    bool across = x & (cell - 1), down = y & (cell - 1);
+    if (across == down)
+        return false;
+    int32_t i = across ? (x & -cell) + half : x, j = down ? (y & -cell) + half : y;
+    return across ? is_seen(self, i, j - half) || is_seen(self, i, j + half)
+                  : is_seen(self, i - half, j) || is_seen(self, i + half, j);
+}
+
+/* Whether marking a vertex, and all that it needs, changes nothing that is drawn of the first pass. */
 static bool is_free(const search *self, int32_t x, int32_t y, const scene_tile **last)
 {
     const lod *l = self->l;
     scene_slot slot = scene_tiles_find(l->tiles, x, y, last);
     if (slot.tile && scene_slot_marked(slot))
         return true;
-    if (self->seen[seen_slot(self, vertex_key(x, y))])
+    if (is_seen(self, x, y) || beside_seen_cell(self, x, y))
         return false;
     int64_t up[2][2];
     tl_lattice_parents(x, y, up);
@@ -141,6 +168,17 @@ static bool may_split(const search *self, const lod_triangle *t)
     int32_t x, y;
     lod_middle(self->l, t, &x, &y);
     return !self->seen || is_free(self, x, y, &last);
+}
+
+/* A leaf of the second pass is left out where the corner that its drawing needs would split what is seen, or where it
+ * would have to be split and must not be: then it would be drawn over voids. */
+static tl_status leave(search *self, const lod_triangle *t, bool whole, tl_error *error)
+{
+    const scene_tile *last = NULL;
+    int32_t x, y;
+    if (self->seen && (!whole || (lod_opposite(self->l, t, &x, &y) && !is_free(self, x, y, &last))))
+        return TL_OK;
+    return lod_leave(self->l, t, self->depth, self->leaves, error);
 }
 
 /* ---- One depth ---- */
@@ -177,7 +215,7 @@ static tl_status sort_out(search *self, tl_error *error)
             triangles[kept++].step = v->step;
         } else if (v->state != LOD_DROPPED) {
             l->stats.pixel_error = fmax(l->stats.pixel_error, self->seen ? 0 : (double)v->pixels);
-            status = lod_leave(l, &triangles[k], self->depth, self->leaves, error);
+            status = leave(self, &triangles[k], v->state != LOD_SPLIT || v->pixels < HUGE_VALF, error);
         }
     }
     self->current.count = kept;
@@ -205,7 +243,7 @@ static tl_status split_all(search *self, tl_error *error)
         const lod_triangle *t = &triangles[k];
         uint32_t middle = lod_asked(l, before + k)->vertex;
         if (middle == LOD_NONE) {
-            status = lod_leave(l, t, self->depth, self->leaves, error);
+            status = leave(self, t, true, error);
             continue;
         }
         lod_triangle *to = (lod_triangle *)self->next.items + self->next.count;
