@@ -170,11 +170,12 @@ def write_meshes():
         talus("simplify", DEM, "-e", 5, "--verify", "-q", "-o", f"mesh.{ending}")
     talus("simplify", DEM, "-e", 5, "--frame", "ecef", "--verify", "-q", "-o", "ecef.glb")
     talus("view", DEM, "--eye", "-84.25,36.55,300", "--above-ground", "--heading", 120, "-l", 2, "--morph", "-q", "-o", "view.glb")
+    talus("simplify", DEM, "-e", 20, "--texture", "colour,normal", "--texture-size", 512, "-q", "-o", "painted.glb")
     # solid, for printing
     talus("simplify", DEM, "-e", 20, "--base", 50, "-q", "-o", "solid.stl")
 
 
-GLBS = [f"{coding}.glb" for coding in CODINGS] + ["ecef.glb", "view.glb"]
+GLBS = [f"{coding}.glb" for coding in CODINGS] + ["ecef.glb", "view.glb", "painted.glb"]
 
 
 def judge_gltf():
@@ -218,7 +219,7 @@ def judge_blender():
     if not have("blender"):
         skip("Blender", "blender")
         return
-    names = [f"{c}.exr" for c in COMPRESSIONS] + ["float.glb", "quantized.glb", "view.glb", "mesh.obj", "mesh.ply", "mesh.stl"]
+    names = [f"{c}.exr" for c in COMPRESSIONS] + ["float.glb", "quantized.glb", "view.glb", "painted.glb", "mesh.obj", "mesh.ply", "mesh.stl"]
     # its Python looks for its modules beside the first python3 of the path, which may be another
     done = run(shutil.which("blender"), "-b", "--factory-startup", "--python", os.path.join(HERE, "blender_judge.py"), "--",
                *[path(name) for name in names], env={**os.environ, "PATH": "/usr/bin:/bin"})
@@ -238,6 +239,8 @@ def judge_blender():
                   near(told["high"], about["high"], 0.02), f"{told} {about}")
             # the importers may drop triangles of no area
             check(f"Blender {name}: triangles", abs(told["triangles"] - about["triangles"]) <= 1e-4 * about["triangles"], told)
+            if name == "painted.glb":
+                check("Blender painted.glb: textures", len(told["textures"]) >= 2, told)
             check(f"Blender {name}: looks up", told["up"] > 0 and math.isfinite(told["up"]), told)
 
 
