@@ -171,26 +171,20 @@ static inline float bounded(float slope)
     return low > 1e9F ? 1e9F : low;
 }
 
-/* Slopes and their square at `count` children of a row that begins at z[0]. */
+/* At `count` children of a row that begins at z[0]: slopes, their square, and the flux (g - mean) grad z / g. One loop,
+ * so that roots and quotients overlap with the rest. */
 static void slope_row(const float *restrict above, const float *restrict z, const float *restrict below, float per_x,
-                      float per_y, size_t count, float *restrict gx, float *restrict gy, float *restrict g2)
+                      float per_y, float mean, size_t count, float *restrict gx, float *restrict gy, float *restrict g2,
+                      float *restrict fx, float *restrict fy)
 {
     for (size_t k = 0; k < count; k++) {
         float x = bounded((z[k + 1] - z[(ptrdiff_t)k - 1]) * per_x), y = bounded((below[k] - above[k]) * per_y);
+        float square = x * x + y * y, share = 1 - mean / sqrtf(square + TINY);
         gx[k] = x;
         gy[k] = y;
-        g2[k] = x * x + y * y;
-    }
-}
-
-/* (g - mean) grad z / g */
-static void flux_row(const float *restrict gx, const float *restrict gy, const float *restrict g2, float mean,
-                     size_t count, float *restrict fx, float *restrict fy)
-{
-    for (size_t k = 0; k < count; k++) {
-        float share = 1 - mean / sqrtf(g2[k] + TINY);
-        fx[k] = gx[k] * share;
-        fy[k] = gy[k] * share;
+        g2[k] = square;
+        fx[k] = x * share;
+        fy[k] = y * share;
     }
 }
 
@@ -203,10 +197,12 @@ static void divergence_row(const float *restrict fx, const float *restrict above
 
 /* ---- Noise ---- */
 
-/* Square amplitudes: energy, less where it is level, over the variance of the steered kernel. */
-static void noise_shape_row(const fbm_relief_step *step, const float *restrict gx, const float *restrict gy,
-                            const float *restrict g2, const float *restrict energy, const float *restrict slack,
-                            size_t count, float *restrict sides, float *restrict corners, float *restrict amplitude)
+/* White noise under the steered kernel. Square amplitudes: energy, less where it is level, over the kernel's variance.
+ */
+static void noise_row(const fbm_relief_step *step, const float *restrict gx, const float *restrict gy,
+                      const float *restrict g2, const float *restrict energy, const float *restrict slack,
+                      const float *restrict above, const float *restrict at, const float *restrict below, size_t count,
+                      float *restrict out)
 {
     const float steer = step->steer, most = .95F, soft = step->steer_slope2, limit = step->limit;
     const float strength = steer < 0 ? -steer : steer, clipped = steer < 0 ? -most : most;
@@ -217,22 +213,11 @@ static void noise_shape_row(const fbm_relief_step *step, const float *restrict g
         float ratio = (clip ? clipped : steer) / ((clip ? square : sum) + TINY);
         float p = ratio * (gx[k] * gx[k] - gy[k] * gy[k]), t = ratio * (2 * gx[k] * gy[k]);
         float variance = whole + 4 * (b * (p * p) + t * t);
-        sides[k] = p;
-        corners[k] = t;
         float free = square + slack[k];
-        amplitude[k] = sqrtf(energy[k] * free / ((free + limit * energy[k] + TINY) * variance));
-    }
-}
-
-static void noise_rows(const float *restrict above, const float *restrict at, const float *restrict below,
-                       const float *restrict sides, const float *restrict corners, const float *restrict amplitude,
-                       size_t count, float *restrict out)
-{
-    for (size_t k = 0; k < count; k++) {
-        float p = sides[k], t = corners[k];
+        float amplitude = sqrtf(energy[k] * free / ((free + limit * energy[k] + TINY) * variance));
         float across = (1 + p) * (at[k] + at[k + 2]) + (1 - p) * (above[k + 1] + below[k + 1]);
         float diagonal = (1 + t) * (above[k] + below[k + 2]) + (1 - t) * (above[k + 2] + below[k]);
-        out[k] = amplitude[k] * (SIDE * SIDE * at[k + 1] + SIDE * across + diagonal);
+        out[k] = amplitude * (b * at[k + 1] + SIDE * across + diagonal);
     }
 }
 
@@ -303,7 +288,7 @@ typedef struct walk {
     float per_x, per_y; /* 1 / two children */
     float *white[RING]; /* from a child before the row */
     float *fx[RING], *fy[RING];
-    float *gx, *gy, *g2, *energies, *slacks, *mixed, *sides, *corners, *amplitude;
+    float *gx, *gy, *g2, *energies, *slacks, *mixed;
     float *noisy[2], *levelled[2];
 } walk;
 
@@ -323,8 +308,8 @@ static void walk_slopes(const walk *w, size_t row)
 {
     const planes *p = w->p;
     const float *z = p->children + (row + 2 * (SMOOTH - NOISE) - 1) * p->child_stride + 2 * (SMOOTH - NOISE) - 1;
-    slope_row(z - p->child_stride, z, z + p->child_stride, w->per_x, w->per_y, w->width + 2, w->gx, w->gy, w->g2);
-    flux_row(w->gx, w->gy, w->g2, w->step->level_slope, w->width + 2, ring(w->fx, row), ring(w->fy, row));
+    slope_row(z - p->child_stride, z, z + p->child_stride, w->per_x, w->per_y, w->step->level_slope, w->width + 2,
+              w->gx, w->gy, w->g2, ring(w->fx, row), ring(w->fy, row));
 }
 
 static void walk_noise(const walk *w, size_t row)
@@ -333,11 +318,9 @@ static void walk_noise(const walk *w, size_t row)
     child_energy(w->energy, w->energy_stride, child_row, -NOISE, w->p->columns, w->mixed, w->energies);
     if (w->slack)
         child_energy(w->slack, w->energy_stride, child_row, -NOISE, w->p->columns, w->mixed, w->slacks);
-    noise_shape_row(w->step, w->gx + 1, w->gy + 1, w->g2 + 1, w->energies, w->slacks, w->width, w->sides, w->corners,
-                    w->amplitude);
     /* white row r is that of walk row r - 1 */
-    noise_rows(ring(w->white, row), ring(w->white, row + 1), ring(w->white, row + 2), w->sides, w->corners,
-               w->amplitude, w->width, w->noisy[(row - 1) & 1]);
+    noise_row(w->step, w->gx + 1, w->gy + 1, w->g2 + 1, w->energies, w->slacks, ring(w->white, row),
+              ring(w->white, row + 1), ring(w->white, row + 2), w->width, w->noisy[(row - 1) & 1]);
 }
 
 static void walk_levelling(const walk *w, size_t row)
@@ -367,9 +350,8 @@ static void make_details(const fbm_kernel *noise, const fbm_relief_step *step, c
         w.fx[k] = row[RING + k];
         w.fy[k] = row[2 * RING + k];
     }
-    w.gx = row[9], w.gy = row[10], w.g2 = row[11], w.energies = row[12], w.mixed = row[13], w.sides = row[14];
-    w.corners = row[15], w.amplitude = p->soften; /* not needed yet, and larger than a row */
-    w.noisy[0] = row[16], w.noisy[1] = row[17], w.levelled[0] = row[18], w.levelled[1] = row[19], w.slacks = row[20];
+    w.gx = row[9], w.gy = row[10], w.g2 = row[11], w.energies = row[12], w.mixed = row[13];
+    w.noisy[0] = row[14], w.noisy[1] = row[15], w.levelled[0] = row[16], w.levelled[1] = row[17], w.slacks = row[18];
     memset(w.slacks, 0, w.width * sizeof *w.slacks);
     size_t rows = 2 * p->rows;
     if (noise) {
@@ -579,8 +561,8 @@ static void add_slopes(const fbm_relief_step *step, const float *heights, fbm_wi
     float per_x = 1 / (2 * step->children_x), per_y = 1 / (2 * step->children_y);
     for (size_t r = 0; r < children.height; r++) {
         const float *z = p.children + (y + r) * p.child_stride + x;
-        slope_row(z - p.child_stride, z, z + p.child_stride, per_x, per_y, children.width, p.row[0], p.row[1],
-                  p.row[2]);
+        slope_row(z - p.child_stride, z, z + p.child_stride, per_x, per_y, 0, children.width, p.row[0], p.row[1],
+                  p.row[2], p.row[3], p.row[4]);
         for (size_t k = 0; k < children.width; k++) {
             uint32_t bits;
             memcpy(&bits, &p.row[2][k], sizeof bits);
