@@ -55,13 +55,16 @@ static bool is_area(const field *f)
 static void cut_voids(const scene_patch *g, bool area, int level, tl_window window, float *out, int64_t stride)
 {
     int64_t unit = (int64_t)1 << level, mask = area ? 0 : unit - 1;
-    for (int64_t row = 0; row < window.height; row++)
-        for (int64_t column = 0; column < window.width; column++) {
-            int64_t x = window.x + column, y = window.y + row;
-            int64_t i = x >> level, j = y >> level, right = (x & mask) != 0, below = (y & mask) != 0;
-            if (!scene_patch_known(g, i, j) || !scene_patch_known(g, i + right, j) ||
-                !scene_patch_known(g, i, j + below) || !scene_patch_known(g, i + right, j + below))
-                out[row * stride + column] = NAN;
+    int64_t right = window.x + window.width, below = window.y + window.height;
+    for (int64_t j = window.y >> level; j <= (below - 1 + mask) >> level; j++)
+        for (int64_t i = window.x >> level; i <= (right - 1 + mask) >> level; i++) {
+            if (scene_patch_known(g, i, j))
+                continue;
+            int64_t x0 = tl_int64_max(i * unit - mask, window.x), x1 = tl_int64_min((i + 1) * unit, right);
+            int64_t y0 = tl_int64_max(j * unit - mask, window.y), y1 = tl_int64_min((j + 1) * unit, below);
+            for (int64_t y = y0; y < y1; y++)
+                for (int64_t x = x0; x < x1; x++)
+                    out[(y - window.y) * stride + x - window.x] = NAN;
         }
 }
 
