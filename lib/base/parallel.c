@@ -222,14 +222,19 @@ tl_status tl_parallel_for(const tl_run *run, uint64_t items, uint64_t samples, t
     return TL_OK;
 }
 
-bool tl_parallel_wait_turn(tl_parallel *loop, uint64_t item)
+bool tl_parallel_wait_near(tl_parallel *loop, uint64_t item, uint64_t ahead)
 {
     pthread_mutex_lock(&loop->lock);
-    while (loop->turn != item && !atomic_load(&loop->stop))
+    while (item - loop->turn >= ahead && !atomic_load(&loop->stop))
         pthread_cond_wait(&loop->changed, &loop->lock);
-    bool mine = loop->turn == item && !atomic_load(&loop->stop);
+    bool good = !atomic_load(&loop->stop);
     pthread_mutex_unlock(&loop->lock);
-    return mine;
+    return good;
+}
+
+bool tl_parallel_wait_turn(tl_parallel *loop, uint64_t item)
+{
+    return tl_parallel_wait_near(loop, item, 1);
 }
 
 void tl_parallel_end_turn(tl_parallel *loop, uint64_t item)

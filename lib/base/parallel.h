@@ -26,6 +26,9 @@ tl_status tl_parallel_for(const tl_run *run, uint64_t items, uint64_t samples, t
  * cancelled, give up. A failing item keeps its turn, so that nobody goes on behind it. Between this and
  * tl_parallel_end_turn at most one item of the loop runs, in order of items. */
 bool tl_parallel_wait_turn(tl_parallel *loop, uint64_t item);
+/* The same for an item that need not be the first of all: until fewer than `ahead` smaller ones are before their turn's
+ * end. */
+bool tl_parallel_wait_near(tl_parallel *loop, uint64_t item, uint64_t ahead);
 void tl_parallel_end_turn(tl_parallel *loop, uint64_t item);
 
 /* TL_ERROR_MEMORY, described, where `bytes` are more than the run may take: `name` is the thing, `work` what is done

@@ -5,6 +5,7 @@
 #include "lib/base/georef.h"
 #include "lib/base/parallel.h"
 #include "lib/base/size.h"
+#include "lib/out/backlog.h"
 #include "lib/out/mip.h"
 #include "lib/out/out.h"
 
@@ -152,9 +153,11 @@ typedef struct worker {
     exr_encode_pipeline_t pipeline;
     bool begun;
     out_extent extent;
-    tl_parallel *loop; /* of the tile in hand, for await_turn */
+    out_backlog *backlog; /* and the rest: where keep_chunk puts the tile in hand */
+    tl_parallel *loop;
     uint64_t tile;
-    bool gave_up; /* another tile has failed */
+    tl_status status;
+    tl_error *error;
 } worker;
 
 typedef struct writing {
@@ -166,15 +169,33 @@ typedef struct writing {
     double half_error; /* see tl_write_options */
     out_mip mip;
     worker *workers;
+    out_backlog backlog;
     stream *to;
 } writing;
 
 /* OpenEXR calls this between compressing and writing. */
-static exr_result_t await_turn(exr_encode_pipeline_t *pipeline)
+static exr_result_t go_on(exr_encode_pipeline_t *pipeline)
+{
+    (void)pipeline;
+    return EXR_ERR_SUCCESS;
+}
+
+/* And this instead of writing. */
+static exr_result_t keep_chunk(exr_encode_pipeline_t *pipeline)
 {
     worker *self = pipeline->encoding_user_data;
-    self->gave_up = !tl_parallel_wait_turn(self->loop, self->tile);
-    return self->gave_up ? EXR_ERR_INCORRECT_CHUNK : EXR_ERR_SUCCESS;
+    self->status = out_backlog_add(self->backlog, self->loop, self->tile, pipeline->compressed_buffer,
+                                   pipeline->compressed_bytes, self->error);
+    return self->status == TL_OK ? EXR_ERR_SUCCESS : EXR_ERR_INCORRECT_CHUNK;
+}
+
+static tl_status write_chunk(void *context, uint64_t tile, const void *bytes, size_t count, tl_error *error)
+{
+    const writing *w = context;
+    tl_window window = out_tile_window(&w->tiling, tile);
+    exr_result_t code = exr_write_tile_chunk(w->file, PART, (int)(window.x / OUT_TILE), (int)(window.y / OUT_TILE),
+                                             w->level, w->level, bytes, count);
+    return code == EXR_ERR_SUCCESS ? TL_OK : exr_failed(code, w->to, error);
 }
 
 /* The file keeps channels by their names' order. */
@@ -226,7 +247,8 @@ static exr_result_t encode(const writing *w, worker *self, tl_window window)
     pipeline->encoding_user_data = self;
     code = self->begun ? EXR_ERR_SUCCESS : exr_encoding_choose_default_routines(w->file, PART, pipeline);
     self->begun = true;
-    pipeline->yield_until_ready_fn = await_turn;
+    pipeline->yield_until_ready_fn = go_on;
+    pipeline->write_fn = keep_chunk;
     if (w->planes->count == 1 && __BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__)
         pipeline->convert_and_pack_fn = pack_rows;
     return code == EXR_ERR_SUCCESS ? exr_encoding_run(w->file, PART, pipeline) : code;
@@ -273,15 +295,15 @@ static tl_status write_tile(void *context, tl_parallel *loop, uint64_t tile, uns
     status = halve_heights(w, self, (size_t)(window.width * window.height), error);
     if (status != TL_OK)
         return status;
+    self->backlog = &w->backlog;
     self->loop = loop;
     self->tile = tile;
+    self->status = TL_OK;
+    self->error = error;
     exr_result_t code = encode(w, self, window);
-    if (self->gave_up)
-        return tl_fail(error, TL_ERROR_CANCELLED, "interrupted");
-    if (code != EXR_ERR_SUCCESS) /* the turn is kept, so that nobody writes behind a failure */
-        return exr_failed(code, w->to, error);
-    tl_parallel_end_turn(loop, tile);
-    return TL_OK;
+    if (self->status != TL_OK || code == EXR_ERR_SUCCESS)
+        return self->status;
+    return exr_failed(code, w->to, error);
 }
 
 /* Level after level; the coarser ones are there when the finer ones are written. */
@@ -294,6 +316,7 @@ static tl_status write_levels(writing *w, const tl_run *run, tl_error *error)
         int64_t width = w->mip.levels[w->level].width, height = w->mip.levels[w->level].height;
         w->tiling = (out_tiling){tl_div_up(width, OUT_TILE), tl_div_up(height, OUT_TILE), width, height};
         uint64_t tiles = (uint64_t)w->tiling.columns * (uint64_t)w->tiling.rows;
+        out_backlog_restart(&w->backlog);
         status = tl_parallel_for(w->level ? &quiet : run, tiles, (uint64_t)(width * height), write_tile, w, error);
     }
     return status;
@@ -302,10 +325,11 @@ static tl_status write_levels(writing *w, const tl_run *run, tl_error *error)
 static tl_status write_tiles(writing *w, const tl_run *run, out_extent *extent, tl_error *error)
 {
     unsigned count = tl_parallel_workers(run, (uint64_t)w->tiling.columns * (uint64_t)w->tiling.rows);
-    tl_status status = TL_OK;
     w->workers = calloc(count, sizeof *w->workers);
     if (!w->workers)
         return tl_fail_memory(error, tl_output_path(w->to->output));
+    w->backlog = (out_backlog){.write = write_chunk, .context = w};
+    tl_status status = out_backlog_init(&w->backlog, count, tl_output_path(w->to->output), error);
     for (unsigned i = 0; i < count; i++) {
         w->workers[i].extent = out_extent_empty();
         w->workers[i].heights = tl_alloc_grid(OUT_TILE, OUT_TILE, w->planes->count * sizeof(float));
@@ -323,6 +347,7 @@ static tl_status write_tiles(writing *w, const tl_run *run, out_extent *extent, 
         free(w->workers[i].heights);
         free(w->workers[i].halves);
     }
+    out_backlog_finish(&w->backlog);
     free(w->workers);
     return status;
 }

@@ -7,6 +7,7 @@
 #include "lib/base/number.h"
 #include "lib/base/parallel.h"
 #include "lib/base/size.h"
+#include "lib/out/backlog.h"
 #include "lib/out/cog.h"
 #include "lib/out/geotiff_pack.h"
 #include "lib/out/mip.h"
@@ -350,6 +351,7 @@ typedef struct writing {
     int level;
     out_tiling tiling; /* of the level in hand */
     worker *workers;
+    out_backlog backlog;
     bool masked;
     mask_tile
         *masks; /* of the level in hand, kept until its heights are written: a few dozen bytes where all is known */
@@ -447,13 +449,16 @@ static tl_status write_tile(void *context, tl_parallel *loop, uint64_t tile, uns
         status = pack_mask(self->samples, self, &w->masks[tile], error);
     if (status != TL_OK)
         return status;
-    if (!tl_parallel_wait_turn(loop, tile))
-        return tl_fail(error, TL_ERROR_CANCELLED, "interrupted");
+    return out_backlog_add(&w->backlog, loop, tile, bytes, left_out ? 0 : count, error);
+}
+
+static tl_status write_packed(void *context, uint64_t tile, const void *bytes, size_t count, tl_error *error)
+{
+    writing *w = context;
     errno = 0;
-    if (!left_out && TIFFWriteRawTile(w->tiff, (uint32_t)tile, (void *)bytes, (tmsize_t)count) != (tmsize_t)count)
-        return tiff_failed(w->packing.path, &w->said, error);
-    tl_parallel_end_turn(loop, tile);
-    return TL_OK;
+    if (!count || TIFFWriteRawTile(w->tiff, (uint32_t)tile, (void *)bytes, (tmsize_t)count) == (tmsize_t)count)
+        return TL_OK;
+    return tiff_failed(w->packing.path, &w->said, error);
 }
 
 /* One level and its directory. */
@@ -467,6 +472,7 @@ static tl_status write_level(writing *w, const tl_run *run, tl_error *error)
         return tiff_failed(w->packing.path, &w->said, error);
     if (w->masked && !(w->masks = calloc((size_t)tiles, sizeof *w->masks)))
         return tl_fail_memory(error, w->packing.path);
+    out_backlog_restart(&w->backlog);
     tl_status status = tl_parallel_for(run, tiles, (uint64_t)(width * height), write_tile, w, error);
     errno = 0;
     if (status == TL_OK && (!TIFFWriteDirectory(w->tiff) || w->said.made))
@@ -482,12 +488,13 @@ static tl_status write_levels(writing *w, const tl_run *run, tl_error *error)
 {
     uint64_t tiles = (uint64_t)w->tiling.columns * (uint64_t)w->tiling.rows;
     unsigned count = tl_parallel_workers(run, tiles);
-    tl_status status = TL_OK;
     tl_run quiet = run ? *run : (tl_run){0};
     quiet.progress = NULL; /* of the coarser levels, which are no work */
     w->workers = calloc(count, sizeof *w->workers);
     if (!w->workers)
         return tl_fail_memory(error, w->packing.path);
+    w->backlog = (out_backlog){.write = write_packed, .context = w};
+    tl_status status = out_backlog_init(&w->backlog, count, w->packing.path, error);
     for (unsigned i = 0; i < count; i++) {
         w->workers[i].samples = malloc(w->packing.bands * TILE_BYTES);
         w->workers[i].packer = out_packer_create(&w->packing);
@@ -503,6 +510,7 @@ static tl_status write_levels(writing *w, const tl_run *run, tl_error *error)
         if (w->workers[i].masks)
             libdeflate_free_compressor(w->workers[i].masks);
     }
+    out_backlog_finish(&w->backlog);
     free(w->workers);
     return status;
 }
