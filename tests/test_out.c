@@ -3,6 +3,7 @@
 #include "dem/crs.h"
 #include "lib/base/error.h"
 #include "lib/base/size.h"
+#include "lib/out/backlog.h"
 #include "lib/out/frame.h"
 #include "lib/out/out.h"
 
@@ -18,6 +19,8 @@
 #include <jansson.h>
 #include <limits.h>
 #include <png.h>
+#include <sched.h>
+#include <stdatomic.h>
 #include <stdio.h>
 #include <string.h>
 #include <unistd.h>
@@ -694,6 +697,56 @@ static void objCountsFromOne(void **state)
     tl_mesh_destroy(mesh);
 }
 
+/* ---- tiles before their turn ---- */
+
+enum { TILES = 40, AHEAD = 5 };
+
+typedef struct late {
+    out_backlog backlog;
+    atomic_int added;
+    int written;
+    uint64_t refused; /* a tile whose writing fails */
+} late;
+
+static tl_status write_in_order(void *context, uint64_t tile, const void *bytes, size_t count, tl_error *error)
+{
+    late *self = context;
+    uint64_t value = 0;
+    if (tile == self->refused)
+        return tl_fail(error, TL_ERROR_IO, "no room for tile %d", (int)tile);
+    memcpy(&value, bytes, count);
+    assert_int_equal(tile, self->written++);
+    assert_int_equal(value, tile);
+    return TL_OK;
+}
+
+/* Two tiles are slow: they wait until the other worker is well ahead. The refused one is before the second. */
+static tl_status add_tile(void *context, tl_parallel *loop, uint64_t tile, unsigned worker, tl_error *error)
+{
+    (void)worker;
+    late *self = context;
+    while (tile % 20 == 0 && self->added < (int)tile + AHEAD)
+        sched_yield();
+    self->added++;
+    uint64_t value = tile;
+    return out_backlog_add(&self->backlog, loop, tile, &value, sizeof value, error);
+}
+
+static void aSlowTileHoldsNobodyUp(void **state)
+{
+    (void)state;
+    for (int fails = 0; fails < 2; fails++) {
+        late self = {.refused = fails ? 5 : TILES};
+        tl_error error;
+        self.backlog = (out_backlog){.write = write_in_order, .context = &self};
+        assert_int_equal(out_backlog_init(&self.backlog, 2, "late", &error), TL_OK);
+        tl_status status = tl_parallel_for(&(tl_run){.threads = 2}, TILES, 0, add_tile, &self, &error);
+        assert_int_equal(status, fails ? TL_ERROR_IO : TL_OK);
+        assert_int_equal(self.written, fails ? 5 : TILES);
+        out_backlog_finish(&self.backlog);
+    }
+}
+
 int main(void)
 {
     const struct CMUnitTest tests[] = {
@@ -719,6 +772,7 @@ int main(void)
         cmocka_unit_test_setup_teardown(samplesWithoutAPlaceAreTold, setUp, tearDown),
         cmocka_unit_test_setup_teardown(plyHoldsTheSamples, setUp, tearDown),
         cmocka_unit_test_setup_teardown(objCountsFromOne, setUp, tearDown),
+        cmocka_unit_test(aSlowTileHoldsNobodyUp),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }
