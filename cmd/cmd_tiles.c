@@ -93,6 +93,10 @@ static void report(const settings *set, const tl_tiles_report *r, double seconds
                     r->spacing);
         return;
     }
+    if (r->complete && !tiles) {
+        command_say(&set->common, "%s: is complete already", folder);
+        return;
+    }
     for (int k = r->first_level; k <= r->last_level; k++)
         if (r->levels[k].tiles)
             command_say(&set->common, "level %-3d %8llu tiles %10llu triangles %11llu bytes, error <= %.4g m", k,

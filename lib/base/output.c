@@ -215,9 +215,9 @@ static int publish(tl_output *output)
 {
     keep_permissions(output);
     if (!output->named) {
-        if (!output->overwrite)
-            return link_unnamed(output->descriptor, output->path);
-        int code = EEXIST;
+        int code = link_unnamed(output->descriptor, output->path);
+        if (code != EEXIST || !output->overwrite)
+            return code;
         for (unsigned attempt = 0; code == EEXIST && attempt < MAX_NAME_TRIES; attempt++) {
             name_temporary(output, attempt);
             code = link_unnamed(output->descriptor, output->temporary);

@@ -90,7 +90,8 @@ static void find_trigonometry(const out_terrain_tile *tile, trigonometry *t)
     int cells = tile->mesh->cells;
     double side = 180 / ldexp(1, tile->level);
     for (int k = 0; k <= cells; k++) {
-        double longitude = (-180 + ((double)tile->column + (double)k / cells) * side) * degree;
+        double east = ((double)tile->column + (double)k / cells) * side;
+        double longitude = (east < 360 ? east - 180 : -180) * degree; /* one number for the one meridian */
         double latitude = (-90 + ((double)tile->row + (double)k / cells) * side) * degree;
         t->cos_x[k] = cos(longitude), t->sin_x[k] = sin(longitude);
         t->cos_y[k] = cos(latitude), t->sin_y[k] = sin(latitude);
@@ -223,12 +224,12 @@ static void put_metadata(const char *text, out_terrain_buffer *to)
 
 /* ---- Parts of a tile ---- */
 
-/* The smallest power of two in which 32767 steps hold the relief; at least a millimetre, so that single precision holds
- * multiples of it. */
+/* The smallest power of two in which 32767 steps hold the relief, at least a millimetre; the header gives the lowest
+ * and highest height in single precision, which must hold them. */
 static double quantum_of(const trigonometry *t)
 {
     double q = 0x1p-10;
-    while ((MOST - 1) * q < t->high - t->low)
+    while ((MOST - 1) * q < t->high - t->low || 0x1p24 * q < fmax(fabs(t->low), fabs(t->high)) + (MOST + 1) * q)
         q *= 2;
     return q;
 }
@@ -258,9 +259,9 @@ static void put_vertices(const scene_tile_mesh *mesh, double low, double q, out_
     last = 0;
     for (size_t k = 0; k < mesh->vertex_count; k++)
         put_difference(to, (mesh->vertices[k].j * MOST + mesh->cells / 2) / mesh->cells, &last);
-    last = 0;
+    last = 0; /* halves go up, for tiles with any lowest height; rint would make them even steps above it */
     for (size_t k = 0; k < mesh->vertex_count; k++)
-        put_difference(to, (int)rint(((double)mesh->vertices[k].z - low) / q), &last);
+        put_difference(to, (int)floor(((double)mesh->vertices[k].z - low) / q + 0.5), &last);
 }
 
 static void put_index(out_terrain_buffer *to, bool wide, uint32_t value)

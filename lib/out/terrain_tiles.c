@@ -62,6 +62,8 @@ typedef struct job {
     int level;
     block_place *blocks;
     size_t block_count;
+    block_place *finer; /* those of the lattice before */
+    size_t finer_count;
     out_piece *pieces; /* of these blocks, without samples */
 } job;
 
@@ -180,16 +182,27 @@ static tl_status read_heights(const job *j, const block_place *at, worker *w, tl
     return scene_geodetic_read(j->lattice, window, w->wide, error);
 }
 
-/* The vertices and cells that a piece gives to a block, from vertex (x0, y0) of its wide heights on. */
+/* The vertices and cells that a piece gives to a block, from vertex (x0, y0) of its wide heights on. Of the vertices
+ * that two pieces have, one may not know what the other does. */
 static void paste(const out_piece *piece, int64_t x0, int64_t y0, worker *w)
 {
-    for (int64_t y = tl_int64_max(0, -y0); y < tl_int64_min(OUT_PIECE, WIDE - y0); y++)
-        for (int64_t x = tl_int64_max(0, -x0); x < tl_int64_min(OUT_PIECE, WIDE - x0); x++) {
+    for (int64_t y = tl_int64_max(0, -y0); y < tl_int64_min(OUT_PIECE_ROW, WIDE - y0); y++)
+        for (int64_t x = tl_int64_max(0, -x0); x < tl_int64_min(OUT_PIECE_ROW, WIDE - x0); x++) {
             int64_t i = x0 + x - GROWTH, j = y0 + y - GROWTH;
-            w->wide[(y0 + y) * WIDE + x0 + x] = piece->z[y * OUT_PIECE + x];
-            if (i >= 0 && j >= 0 && i < SCENE_BLOCK_SIDE && j < SCENE_BLOCK_SIDE)
+            float z = piece->z[y * OUT_PIECE_ROW + x];
+            if (isfinite(z))
+                w->wide[(y0 + y) * WIDE + x0 + x] = z;
+            if (x < OUT_PIECE && y < OUT_PIECE && i >= 0 && j >= 0 && i < SCENE_BLOCK_SIDE && j < SCENE_BLOCK_SIDE)
                 w->block.lost[j * SCENE_BLOCK_SIDE + i] = piece->lost[y * OUT_PIECE + x];
         }
+}
+
+static int compare_blocks(const void *a, const void *b)
+{
+    const block_place *p = a, *q = b;
+    if (p->row != q->row)
+        return p->row < q->row ? -1 : 1;
+    return (p->column > q->column) - (p->column < q->column);
 }
 
 /* From the pieces of the finer lattice. A piece is as wide as the world of the lattice of the roots. */
@@ -204,10 +217,16 @@ static tl_status gather_heights(const job *j, const block_place *at, worker *w, 
         int64_t column = 2 * at->column + k % 4 - 1, row = 2 * at->row + k / 4 - 1;
         bool found;
         out_piece piece = {.level = j->level + 1, .column = (column % across + across) % across, .row = row};
-        if (row < 0 || row >= down)
+        const block_place wanted = {piece.column, row};
+        if (row < 0 || row >= down || !bsearch(&wanted, j->finer, j->finer_count, sizeof wanted, compare_blocks))
             continue;
         status = out_piece_load(&piece, j->folder, true, &found, error);
-        if (status == TL_OK && found && piece.z)
+        if (status == TL_OK && !found)
+            status = tl_fail(error, TL_ERROR_DATA,
+                             "%s/.talus: block %lld, %lld of level %d is gone or broken; run again "
+                             "with --resume",
+                             j->folder, (long long)piece.column, (long long)row, piece.level);
+        if (status == TL_OK && piece.z)
             paste(&piece, column * OUT_PIECE - at->column * SCENE_BLOCK + SCENE_RIM + GROWTH,
                   row * OUT_PIECE - at->row * SCENE_BLOCK + SCENE_RIM + GROWTH, w);
         out_piece_finish(&piece);
@@ -261,6 +280,20 @@ static tl_status make_folder(const char *path, tl_error *error)
     return mkdir(path, 0777) == 0 || errno == EEXIST ? TL_OK : tl_fail_system(error, path, "make", errno);
 }
 
+/* Whether a file holds what was written into it. */
+static bool is_whole(const char *path, const out_piece_tile *tile)
+{
+    size_t wanted = (size_t)tile->bytes;
+    FILE *file = fopen(path, "rb");
+    unsigned char *bytes = file ? malloc(wanted + 1) : NULL;
+    bool whole =
+        bytes && fread(bytes, 1, wanted + 1, file) == wanted && libdeflate_crc32(0, bytes, wanted) == tile->checksum;
+    free(bytes);
+    if (file)
+        fclose(file);
+    return whole;
+}
+
 static tl_status write_tile(const job *j, const out_piece_tile *tile, const out_terrain_buffer *bytes, tl_error *error)
 {
     size_t room = strlen(j->folder) + 96;
@@ -274,10 +307,12 @@ static tl_status write_tile(const job *j, const out_piece_tile *tile, const out_
         status = make_folder(path, error);
     snprintf(path, room, "%s/%d/%lld/%lld.terrain", j->folder, tile->level, (long long)tile->column,
              (long long)tile->row);
-    tl_output *output = status == TL_OK ? tl_output_open(path, true, error) : NULL;
-    if (status == TL_OK && !output)
+    /* one that is there from a run that was killed stays as it is */
+    bool there = status == TL_OK && is_whole(path, tile);
+    tl_output *output = status == TL_OK && !there ? tl_output_open(path, true, error) : NULL;
+    if (status == TL_OK && !there && !output)
         status = TL_ERROR_IO;
-    if (status == TL_OK) {
+    if (output) {
         status = tl_output_append(output, bytes->packed, bytes->packed_count, error);
         if (status == TL_OK)
             status = tl_output_commit(output, error);
@@ -399,15 +434,17 @@ static bool known_around(const worker *w, size_t at)
  * triangles of the cell. Nothing is lost where nothing is known. */
 static tl_status fill_piece(const worker *w, out_piece *piece, tl_error *error)
 {
-    piece->z = tl_alloc_grid(OUT_PIECE, OUT_PIECE, sizeof *piece->z);
+    piece->z = tl_alloc_grid(OUT_PIECE_ROW, OUT_PIECE_ROW, sizeof *piece->z);
     piece->lost = tl_alloc_grid(OUT_PIECE, OUT_PIECE, sizeof *piece->lost);
     if (!piece->z || !piece->lost)
         return tl_fail_memory(error, "a block of tiles");
+    for (int y = 0; y < OUT_PIECE_ROW; y++)
+        for (int x = 0; x < OUT_PIECE_ROW; x++)
+            piece->z[y * OUT_PIECE_ROW + x] =
+                w->wide[(size_t)(SCENE_RIM + GROWTH + 2 * y) * WIDE + (size_t)(SCENE_RIM + GROWTH + 2 * x)];
     for (int y = 0; y < OUT_PIECE; y++)
         for (int x = 0; x < OUT_PIECE; x++) {
             size_t at = (size_t)(SCENE_RIM + 2 * y) * ROW + (size_t)(SCENE_RIM + 2 * x);
-            piece->z[y * OUT_PIECE + x] =
-                w->wide[(size_t)(SCENE_RIM + GROWTH + 2 * y) * WIDE + (size_t)(SCENE_RIM + GROWTH + 2 * x)];
             piece->lost[y * OUT_PIECE + x] = known_around(w, at + ROW + 1) ? w->block.errors[at + ROW + 1] : 0;
         }
     return TL_OK;
@@ -455,13 +492,7 @@ static bool tiles_are_whole(const job *j, const out_piece *piece)
             continue;
         snprintf(path, room, "%s/%d/%lld/%lld.terrain", j->folder, tile->level, (long long)tile->column,
                  (long long)tile->row);
-        unsigned char *bytes = malloc((size_t)tile->bytes + 1);
-        FILE *file = fopen(path, "rb");
-        whole = file && bytes && fread(bytes, 1, (size_t)tile->bytes + 1, file) == (size_t)tile->bytes &&
-                libdeflate_crc32(0, bytes, (size_t)tile->bytes) == tile->checksum;
-        free(bytes);
-        if (file)
-            fclose(file);
+        whole = is_whole(path, tile);
     }
     free(path);
     return whole;
@@ -573,14 +604,6 @@ static tl_status do_lattice(job *j, tl_error *error)
 
 /* ---- Which blocks there are ---- */
 
-static int compare_blocks(const void *a, const void *b)
-{
-    const block_place *p = a, *q = b;
-    if (p->row != q->row)
-        return p->row < q->row ? -1 : 1;
-    return (p->column > q->column) - (p->column < q->column);
-}
-
 static void sort_blocks(job *j)
 {
     size_t kept = 0;
@@ -625,8 +648,14 @@ static void take_shard(job *j)
     j->block_count = kept;
 }
 
-static void go_up(job *j)
+static tl_status go_up(job *j, tl_error *error)
 {
+    free(j->finer);
+    j->finer = tl_alloc(j->block_count, sizeof *j->finer);
+    j->finer_count = j->finer ? j->block_count : 0;
+    if (!j->finer)
+        return tl_fail_memory(error, j->folder);
+    memcpy(j->finer, j->blocks, j->block_count * sizeof *j->finer);
     int64_t across = blocks_across(j->level);
     for (size_t k = 0; k < j->block_count; k++) {
         j->blocks[k].column = across > 1 ? j->blocks[k].column / 2 : 0;
@@ -634,6 +663,7 @@ static void go_up(job *j)
     }
     sort_blocks(j);
     j->level--;
+    return TL_OK;
 }
 
 /* ---- The folder ---- */
@@ -697,13 +727,15 @@ static bool holds(const char *folder, const char *name, const char *text)
     return same;
 }
 
+/* But for what a run leaves behind that was killed when it had just begun. */
 static bool is_empty(const char *folder)
 {
     DIR *directory = opendir(folder);
     struct dirent *entry;
     bool empty = true;
     while (directory && empty && (entry = readdir(directory)))
-        empty = strcmp(entry->d_name, ".") == 0 || strcmp(entry->d_name, "..") == 0;
+        empty = strcmp(entry->d_name, ".") == 0 || strcmp(entry->d_name, "..") == 0 ||
+                strncmp(entry->d_name, ".talus", 6) == 0;
     if (directory)
         closedir(directory);
     return empty;
@@ -721,11 +753,12 @@ static bool exists(const char *folder, const char *name)
 static tl_status begin_folder(const job *j, const char *text, tl_error *error)
 {
     bool go_on = j->options->resume || j->options->shards || j->options->finish;
-    bool begun = exists(j->folder, ".talus/job.json");
     tl_status status = make_folder(j->folder, error);
     if (status != TL_OK)
         return status;
-    if (!begun && !is_empty(j->folder) && !(j->options->shards && exists(j->folder, ".talus")))
+    /* in this order: another shard begins before it writes tiles */
+    bool empty = is_empty(j->folder), begun = exists(j->folder, ".talus/job.json");
+    if (!begun && !empty)
         return tl_fail(error, TL_ERROR_IO, "%s: is not empty, and holds no tiles that were begun; name another folder",
                        j->folder);
     if (begun && !go_on)
@@ -743,7 +776,7 @@ static tl_status begin_folder(const job *j, const char *text, tl_error *error)
     return status;
 }
 
-/* Removes the pieces; what cannot be removed does no harm. */
+/* Removes the pieces, and last what says that they belong to a job; what cannot be removed does no harm. */
 static void clear_work(const job *j)
 {
     char *work = inside(j->folder, ".talus");
@@ -751,14 +784,18 @@ static void clear_work(const job *j)
     struct dirent *entry;
     while (directory && (entry = readdir(directory))) {
         char *path = inside(work, entry->d_name);
-        if (path && entry->d_name[0] != '.')
+        if (path && entry->d_name[0] != '.' && strcmp(entry->d_name, "job.json") != 0)
             unlink(path);
         free(path);
     }
     if (directory)
         closedir(directory);
+    char *said = inside(j->folder, ".talus/job.json");
+    if (said)
+        unlink(said);
     if (work)
         rmdir(work);
+    free(said);
     free(work);
 }
 
@@ -810,10 +847,26 @@ static char *describe_layer(const job *j)
     for (size_t k = 0; k < j->source->info.parameter_count; k++)
         json_object_set_new(record, j->source->info.parameters[k].name,
                             json_string(j->source->info.parameters[k].value));
+    char *job_text = describe_job(j);
+    json_object_set_new(record, "job", job_text ? json_loads(job_text, 0, NULL) : NULL);
+    free(job_text);
     json_object_set_new(root, "talus", record);
-    char *text = json_dumps(root, JSON_INDENT(1) | JSON_REAL_PRECISION(15));
+    char *text = json_dumps(root, JSON_INDENT(1) | JSON_REAL_PRECISION(17));
     json_decref(root);
     return text;
+}
+
+/* Whether a pyramid is there already, of this very job. */
+static bool is_complete(const job *j, const char *text)
+{
+    char *path = inside(j->folder, "layer.json");
+    json_t *layer = path ? json_load_file(path, 0, NULL) : NULL, *wanted = json_loads(text, 0, NULL);
+    json_t *made = json_object_get(json_object_get(layer, "talus"), "job");
+    bool same = made && wanted && json_equal(made, wanted);
+    json_decref(wanted);
+    json_decref(layer);
+    free(path);
+    return same;
 }
 
 static tl_status finish_folder(job *j, tl_error *error)
@@ -876,6 +929,12 @@ static tl_status work(job *j, tl_error *error)
         return status;
     }
     char *text = describe_job(j);
+    if (text && (j->options->resume || j->options->finish) && is_complete(j, text)) {
+        free(text);
+        clear_work(j); /* which may not have come to its end */
+        j->report.complete = true;
+        return TL_OK;
+    }
     status = text ? begin_folder(j, text, error) : tl_fail_memory(error, j->folder);
     free(text);
     if (status == TL_OK && j->options->shards)
@@ -885,8 +944,9 @@ static tl_status work(job *j, tl_error *error)
         status = do_lattice(j, error);
     while (status == TL_OK && !j->options->shards && j->level > ROOT_LATTICE &&
            j->level - 2 > j->options->first_level) {
-        go_up(j);
-        status = do_lattice(j, error);
+        status = go_up(j, error);
+        if (status == TL_OK)
+            status = do_lattice(j, error);
     }
     return status == TL_OK && !j->options->shards ? finish_folder(j, error) : status;
 }
@@ -897,10 +957,6 @@ tl_status tl_write_terrain_tiles(const tl_source *source, const char *folder, co
     static const tl_tiles_options defaults;
     job j = {.source = source, .folder = folder, .options = options ? options : &defaults};
     tl_status status = check_options(j.options, folder, error);
-    if (status == TL_OK && j.options->resume && !exists(folder, ".talus") && exists(folder, "layer.json")) {
-        *out = (tl_tiles_report){.complete = true};
-        return TL_OK; /* there is nothing left to do */
-    }
     if (status == TL_OK)
         status = choose_levels(&j, error);
     if (status == TL_OK) {
@@ -912,5 +968,6 @@ tl_status tl_write_terrain_tiles(const tl_source *source, const char *folder, co
     scene_geodetic_destroy(j.lattice);
     out_tile_list_finish(&j.list);
     free(j.blocks);
+    free(j.finer);
     return status;
 }

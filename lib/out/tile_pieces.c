@@ -7,21 +7,23 @@
 #include <libdeflate.h>
 
 #include <errno.h>
+#include <stddef.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
 enum {
-    SAMPLES = OUT_PIECE * OUT_PIECE,
-    VALUES_BYTES = SAMPLES * 6,
+    HEIGHTS = OUT_PIECE_ROW * OUT_PIECE_ROW,
+    CELLS = OUT_PIECE * OUT_PIECE,
+    VALUES_BYTES = 4 * HEIGHTS + 2 * CELLS,
     QUICK = 1,
     MOST_TILES = 1 << 12,
-    MAGIC = 0x31504c54
+    MAGIC = 0x32504c54
 };
 
 /* At the head of a file; all in the machine's own order, for a piece stays where it was made. */
 typedef struct head {
-    uint32_t magic, values_checksum;
+    uint32_t magic, checksum;    /* of all that follows */
     uint64_t tile_count, packed; /* packed: bytes of the values; 0: none */
     double resampling;
 } head;
@@ -34,6 +36,14 @@ static char *path_of(const out_piece *piece, const char *folder)
         snprintf(path, room, "%s/.talus/%d_%lld_%lld.piece", folder, piece->level, (long long)piece->column,
                  (long long)piece->row);
     return path;
+}
+
+static uint32_t checksum_of(const head *h, const out_piece_tile *tiles, const unsigned char *packed)
+{
+    const size_t skipped = offsetof(head, tile_count);
+    uint32_t sum = libdeflate_crc32(0, (const unsigned char *)h + skipped, sizeof *h - skipped);
+    sum = h->tile_count ? libdeflate_crc32(sum, tiles, h->tile_count * sizeof *tiles) : sum;
+    return h->packed ? libdeflate_crc32(sum, packed, h->packed) : sum;
 }
 
 /* The upper half of a float's bits, rounded up: heights that are lost are never understated. */
@@ -55,33 +65,38 @@ static float widen(uint16_t half)
 /* Bytes of a kind beside each other compress better. */
 static void pack_values(const out_piece *piece, unsigned char *to)
 {
-    for (size_t k = 0; k < SAMPLES; k++) {
+    for (size_t k = 0; k < HEIGHTS; k++) {
         uint32_t bits;
-        uint16_t half = round_up(piece->lost[k]);
         memcpy(&bits, &piece->z[k], sizeof bits);
         for (int b = 0; b < 4; b++)
-            to[(size_t)b * SAMPLES + k] = (unsigned char)(bits >> 8 * b);
-        to[4 * (size_t)SAMPLES + k] = (unsigned char)half;
-        to[5 * (size_t)SAMPLES + k] = (unsigned char)(half >> 8);
+            to[(size_t)b * HEIGHTS + k] = (unsigned char)(bits >> 8 * b);
+    }
+    to += 4 * (size_t)HEIGHTS;
+    for (size_t k = 0; k < CELLS; k++) {
+        uint16_t half = round_up(piece->lost[k]);
+        to[k] = (unsigned char)half;
+        to[CELLS + k] = (unsigned char)(half >> 8);
     }
 }
 
 static void unpack_values(const unsigned char *from, out_piece *piece)
 {
-    for (size_t k = 0; k < SAMPLES; k++) {
+    for (size_t k = 0; k < HEIGHTS; k++) {
         uint32_t bits = 0;
         for (int b = 0; b < 4; b++)
-            bits |= (uint32_t)from[(size_t)b * SAMPLES + k] << 8 * b;
+            bits |= (uint32_t)from[(size_t)b * HEIGHTS + k] << 8 * b;
         memcpy(&piece->z[k], &bits, sizeof bits);
-        piece->lost[k] = widen((uint16_t)(from[4 * (size_t)SAMPLES + k] | from[5 * (size_t)SAMPLES + k] << 8));
     }
+    from += 4 * (size_t)HEIGHTS;
+    for (size_t k = 0; k < CELLS; k++)
+        piece->lost[k] = widen((uint16_t)(from[k] | from[CELLS + k] << 8));
 }
 
 static tl_status write_all(const out_piece *piece, const char *path, const unsigned char *packed, size_t count,
                            tl_error *error)
 {
     head h = {.magic = MAGIC, .tile_count = piece->tile_count, .packed = count, .resampling = piece->resampling};
-    h.values_checksum = libdeflate_crc32(0, packed, count);
+    h.checksum = checksum_of(&h, piece->tiles, packed);
     tl_output *output = tl_output_open(path, true, error);
     if (!output)
         return TL_ERROR_IO;
@@ -125,8 +140,8 @@ static bool unpack(const unsigned char *packed, size_t count, out_piece *piece)
 {
     struct libdeflate_decompressor *decompressor = libdeflate_alloc_decompressor();
     unsigned char *values = malloc(VALUES_BYTES);
-    piece->z = tl_alloc(SAMPLES, sizeof *piece->z);
-    piece->lost = tl_alloc(SAMPLES, sizeof *piece->lost);
+    piece->z = tl_alloc(HEIGHTS, sizeof *piece->z);
+    piece->lost = tl_alloc(CELLS, sizeof *piece->lost);
     bool good =
         decompressor && values && piece->z && piece->lost &&
         libdeflate_deflate_decompress(decompressor, packed, count, values, VALUES_BYTES, NULL) == LIBDEFLATE_SUCCESS;
@@ -138,11 +153,14 @@ static bool unpack(const unsigned char *packed, size_t count, out_piece *piece)
     return good;
 }
 
-static bool read_values(FILE *file, const head *h, out_piece *piece)
+/* The values are looked at even where they are not wanted: what has rotted is found before it is built on. */
+static bool read_values(FILE *file, const head *h, out_piece *piece, bool samples)
 {
-    unsigned char *packed = h->packed <= 2 * VALUES_BYTES ? malloc(h->packed) : NULL;
-    bool good = packed && fread(packed, 1, h->packed, file) == h->packed &&
-                libdeflate_crc32(0, packed, h->packed) == h->values_checksum && unpack(packed, h->packed, piece);
+    unsigned char *packed = h->packed <= 2 * VALUES_BYTES ? malloc(h->packed + 1) : NULL;
+    bool good = packed && fread(packed, 1, h->packed + 1, file) == h->packed &&
+                checksum_of(h, piece->tiles, packed) == h->checksum;
+    if (good && samples && h->packed)
+        good = unpack(packed, h->packed, piece);
     free(packed);
     return good;
 }
@@ -154,10 +172,10 @@ static bool read_file(FILE *file, out_piece *piece, bool samples)
         return false;
     piece->tile_count = h.tile_count;
     piece->resampling = h.resampling;
-    piece->tiles = tl_alloc(h.tile_count, sizeof *piece->tiles);
+    piece->tiles = tl_alloc(h.tile_count + 1, sizeof *piece->tiles);
     if (!piece->tiles || fread(piece->tiles, sizeof *piece->tiles, h.tile_count, file) != h.tile_count)
         return false;
-    return !samples || !h.packed || read_values(file, &h, piece);
+    return read_values(file, &h, piece, samples);
 }
 
 tl_status out_piece_load(out_piece *piece, const char *folder, bool samples, bool *found, tl_error *error)

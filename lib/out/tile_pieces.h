@@ -7,7 +7,7 @@
 #include "lib/scene/tile_block.h"
 #include "lib/talus.h"
 
-enum { OUT_PIECE = SCENE_BLOCK / 2 }; /* vertices, and cells, on a side */
+enum { OUT_PIECE = SCENE_BLOCK / 2, OUT_PIECE_ROW = OUT_PIECE + 1 }; /* cells and vertices on a side */
 
 typedef struct out_piece_tile {
     int32_t level;
@@ -23,7 +23,10 @@ typedef struct out_piece {
     double resampling; /* metres: see tl_tiles_report */
     uint64_t tile_count;
     out_piece_tile *tiles;
-    float *z, *lost; /* OUT_PIECE^2 each; NULL in a piece without tiles */
+    /* Of all vertices, those too that the next blocks to the east and north begin with: at a pole, and beside blocks
+     * where nothing is known, nobody else has them. NULL in a piece without tiles. */
+    float *z;    /* OUT_PIECE_ROW^2; NaN: not known */
+    float *lost; /* OUT_PIECE^2 */
 } out_piece;
 
 /* Writes FOLDER/.talus/LEVEL_COLUMN_ROW.piece. */
