@@ -358,7 +358,7 @@ static void find_patch(const scene_geodetic *g, const tl_window *w, double *at)
         for (int64_t x = 0; x < w->width; x++) {
             int64_t column = ((w->x + x - g->window.x) % columns + columns) % columns;
             if (column >= g->window.width || line < 0 || line >= g->window.height)
-                row[2 * x] = row[2 * x + 1] = NAN; /* beyond what positions are known for */
+                row[2 * x] = row[2 * x + 1] = (double)NAN; /* beyond what positions are known for */
         }
     }
 }
