@@ -92,10 +92,11 @@ typedef struct journey {
     const lod_ground *ground;
     const flight *path;
     const tl_run *run;
-    tl_roam *roam;   /* NULL: frames start from nothing */
-    json_t *list;    /* statistics; NULL: not wanted */
-    tl_mesh *before; /* of the frame before, where shifts are measured; else NULL */
-    double largest;  /* shift in all frames, pixels */
+    tl_roam *roam;            /* NULL: frames start from nothing */
+    tl_view_painter *painter; /* NULL: frames are no pictures */
+    json_t *list;             /* statistics; NULL: not wanted */
+    tl_mesh *before;          /* of the frame before, where shifts are measured; else NULL */
+    double largest;           /* shift in all frames, pixels */
 } journey;
 
 static bool draws_pictures(const settings *set)
@@ -140,12 +141,8 @@ static tl_status draw_frame(const journey *j, const tl_mesh *mesh, size_t frame,
 {
     tl_view views[OPEN_VIEWS];
     size_t count;
-    tl_view_picture_options look = j->set->picture.look;
-    look.overwrite = j->set->common.overwrite;
-    look.run = j->run;
     tl_status status = views_of_frame(j, frame, views, &count, error);
-    return status == TL_OK ? tl_view_write_picture(mesh, j->ground->opened.source, views, count, name, &look, error)
-                           : status;
+    return status == TL_OK ? tl_view_painter_write(j->painter, mesh, views, count, name, error) : status;
 }
 
 static tl_status write_frame(const journey *j, const tl_mesh *mesh, size_t frame, tl_error *error)
@@ -257,19 +254,34 @@ static int fly_all(journey *j, const flight *path, progress *bar)
     return EXIT_DONE;
 }
 
+static bool open_journey(journey *j, tl_error *error)
+{
+    const settings *set = j->set;
+    const tl_source *dem = j->ground->opened.source;
+    bool ready = true;
+    if (set->lod.lod.selector == TL_SELECTOR_ROAM)
+        ready = (j->roam = tl_roam_create(j->ground->field, dem, j->ground->pyramid, &set->lod.lod, error)) != NULL;
+    tl_view_picture_options look = set->picture.look;
+    look.overwrite = set->common.overwrite;
+    look.run = j->run;
+    if (ready && draws_pictures(set))
+        ready = (j->painter = tl_view_painter_create(dem, &look, error)) != NULL;
+    return ready;
+}
+
 static int start(const settings *set, const lod_ground *ground, const flight *path, const tl_run *run, progress *bar)
 {
     tl_error error;
     journey j = {.set = set, .ground = ground, .path = path, .run = run};
-    if (set->lod.lod.selector == TL_SELECTOR_ROAM) {
-        j.roam = tl_roam_create(ground->field, ground->opened.source, ground->pyramid, &set->lod.lod, &error);
-        if (!j.roam)
-            return command_failed(bar, &error);
+    if (!open_journey(&j, &error)) {
+        tl_roam_destroy(j.roam);
+        return command_failed(bar, &error);
     }
     j.list = set->json ? json_array() : NULL;
     progress_stage(bar, "flying");
     int status = fly_all(&j, path, bar);
     tl_roam_destroy(j.roam);
+    tl_view_painter_destroy(j.painter);
     tl_mesh_destroy(j.before);
     if (status == EXIT_DONE && j.list) {
         json_t *root = json_pack("{s:O}", "frames", j.list);

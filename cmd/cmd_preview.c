@@ -37,6 +37,16 @@ static bool settings_ok(settings *set)
         complain("--beside goes with a hillshade, not with a perspective");
         return false;
     }
+    if (set->preview.colour && strcmp(set->preview.colour, "hypsometric") == 0)
+        set->preview.colour = NULL;
+    if (set->preview.colour && (set->preview.grey || !set->preview.perspective)) {
+        complain("--colour goes with --perspective, and without --grey");
+        return false;
+    }
+    if (set->preview.colour && strcmp(set->preview.colour, set->common.output) == 0) {
+        complain("%s: is the picture's colours; name another -o", set->common.output);
+        return false;
+    }
     set->preview.width = (int)set->width;
     set->preview.height = (int)set->height;
     set->preview.overwrite = set->common.overwrite;
@@ -75,6 +85,10 @@ static int run(const command *self, int argc, const char **argv, bool help)
         {"height", 0, OPTION_INTEGER, &set.height, NULL, "N",
          "pixels, 1...32768 (default: by the raster's shape; 1080 in perspective)", 1, 32768, NULL},
         {"beside", 0, OPTION_TEXT, &set.beside, NULL, "FILE", "a second raster of the same place, drawn to the right",
+         0, 0, NULL},
+        {"colour", 0, OPTION_TEXT, &set.preview.colour, NULL, "FILE|LAYER",
+         "of a perspective: a raster of red, green and blue in the DEM's CRS; normal, slope or splat of the DEM; or "
+         "hypsometric: by height, the default",
          0, 0, NULL},
         {"grey", 0, OPTION_FLAG, &set.preview.grey, NULL, NULL, "shade only, no colours by height", 0, 0, NULL},
         {0}};

@@ -14,51 +14,52 @@ typedef struct picture_options {
 } picture_options;
 
 /* The rows of the options of light and air in a `picture_options`, for use inside of an array of options. */
-#define LOOK_OPTIONS(p)                                                                                       \
-    {"sun-azimuth",                                                                                           \
-     0,                                                                                                       \
-     OPTION_NUMBER,                                                                                           \
-     &(p).look.sun_azimuth,                                                                                   \
-     &(p).azimuth_given,                                                                                      \
-     "DEG",                                                                                                   \
-     "of a picture: clockwise from north, 0...360 (default: 315)",                                            \
-     0,                                                                                                       \
-     360,                                                                                                     \
-     NULL},                                                                                                   \
-        {"sun-elevation",                                                                                     \
-         0,                                                                                                   \
-         OPTION_NUMBER,                                                                                       \
-         &(p).look.sun_elevation,                                                                             \
-         &(p).elevation_given,                                                                                \
-         "DEG",                                                                                               \
-         "above the horizon, 1...90 (default: 45)",                                                           \
-         1,                                                                                                   \
-         90,                                                                                                  \
-         NULL},                                                                                               \
-        {"haze",                                                                                              \
-         0,                                                                                                   \
-         OPTION_NUMBER,                                                                                       \
-         &(p).look.haze,                                                                                      \
-         NULL,                                                                                                \
-         "METRES",                                                                                            \
-         "at which half of the light is lost, 1...1e9 (default: clear air)",                                  \
-         1,                                                                                                   \
-         1e9,                                                                                                 \
-         NULL},                                                                                               \
-        {"colour",                                                                                            \
-         0,                                                                                                   \
-         OPTION_TEXT,                                                                                         \
-         &(p).look.colour,                                                                                    \
-         NULL,                                                                                                \
-         "FILE",                                                                                              \
-         "a raster of red, green and blue in the DEM's CRS, or hypsometric: by height, the default",          \
-         0,                                                                                                   \
-         0,                                                                                                   \
-         NULL},                                                                                               \
-        {"grey", 0, OPTION_FLAG, &(p).look.grey, NULL, NULL, "shade only, no colours by height", 0, 0, NULL}, \
-    {                                                                                                         \
-        "facets", 0, OPTION_FLAG, &(p).look.facets, NULL, NULL,                                               \
-            "light each triangle by itself, so that one sees them", 0, 0, NULL                                \
+#define LOOK_OPTIONS(p)                                                                                             \
+    {"sun-azimuth",                                                                                                 \
+     0,                                                                                                             \
+     OPTION_NUMBER,                                                                                                 \
+     &(p).look.sun_azimuth,                                                                                         \
+     &(p).azimuth_given,                                                                                            \
+     "DEG",                                                                                                         \
+     "of a picture: clockwise from north, 0...360 (default: 315)",                                                  \
+     0,                                                                                                             \
+     360,                                                                                                           \
+     NULL},                                                                                                         \
+        {"sun-elevation",                                                                                           \
+         0,                                                                                                         \
+         OPTION_NUMBER,                                                                                             \
+         &(p).look.sun_elevation,                                                                                   \
+         &(p).elevation_given,                                                                                      \
+         "DEG",                                                                                                     \
+         "above the horizon, 1...90 (default: 45)",                                                                 \
+         1,                                                                                                         \
+         90,                                                                                                        \
+         NULL},                                                                                                     \
+        {"haze",                                                                                                    \
+         0,                                                                                                         \
+         OPTION_NUMBER,                                                                                             \
+         &(p).look.haze,                                                                                            \
+         NULL,                                                                                                      \
+         "METRES",                                                                                                  \
+         "at which half of the light is lost, 1...1e9 (default: clear air)",                                        \
+         1,                                                                                                         \
+         1e9,                                                                                                       \
+         NULL},                                                                                                     \
+        {"colour",                                                                                                  \
+         0,                                                                                                         \
+         OPTION_TEXT,                                                                                               \
+         &(p).look.colour,                                                                                          \
+         NULL,                                                                                                      \
+         "FILE|LAYER",                                                                                              \
+         "a raster of red, green and blue in the DEM's CRS; normal, slope or splat of the DEM; or hypsometric: by " \
+         "height, the default",                                                                                     \
+         0,                                                                                                         \
+         0,                                                                                                         \
+         NULL},                                                                                                     \
+        {"grey", 0, OPTION_FLAG, &(p).look.grey, NULL, NULL, "shade only, no colours by height", 0, 0, NULL},       \
+    {                                                                                                               \
+        "facets", 0, OPTION_FLAG, &(p).look.facets, NULL, NULL,                                                     \
+            "light each triangle by itself, so that one sees them", 0, 0, NULL                                      \
     }
 /* Of one picture: */
 #define PICTURE_OPTIONS(p)                                                                                             \

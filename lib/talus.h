@@ -817,8 +817,9 @@ typedef struct tl_view_picture_options {
     double haze;                       /* metres at which half of the light is lost in the air; 0: clear */
     double exaggeration;               /* factor on the mesh's heights, not on the eye's, 0 ... 1e6; 0: 1 */
     bool grey;                         /* no colours by height */
-    /* A raster in dem's CRS that is laid over the mesh: bands of red, green and blue bytes, or one of grey. Where it
-     * has none, and where this is NULL: colours by height. Far ground has the means of what a pixel covers. */
+    /* A raster in dem's CRS that is laid over the mesh: bands of red, green and blue bytes, or one of grey. Or one of
+     * these layers of dem: normal, slope (white: 90 degrees), splat (rock and scree in greys, soil green, snow white).
+     * Where it has none, and where this is NULL: colours by height. Far ground has the means of what a pixel covers. */
     const char *colour;
     bool facets; /* light each triangle by itself; else by normals at its corners, means over the triangles
                     around weighted by their areas, so that no triangle shows */
@@ -835,6 +836,15 @@ typedef struct tl_view_picture_options {
  * that they get: motion blur. Equal for any number of threads. */
 TL_API tl_status tl_view_write_picture(const tl_mesh *mesh, const tl_source *dem, const tl_view *views, size_t count,
                                        const char *path, const tl_view_picture_options *options, tl_error *error);
+
+/* What many pictures of one model share: its colours are read once. Borrows `dem`, and copies the options but not
+ * their texts and their run. The pictures are those of tl_view_write_picture. The destroyer takes NULL. */
+typedef struct tl_view_painter tl_view_painter;
+TL_API tl_view_painter *tl_view_painter_create(const tl_source *dem, const tl_view_picture_options *options,
+                                               tl_error *error);
+TL_API tl_status tl_view_painter_write(const tl_view_painter *painter, const tl_mesh *mesh, const tl_view *views,
+                                       size_t count, const char *path, tl_error *error);
+TL_API void tl_view_painter_destroy(tl_view_painter *painter);
 
 /* A distribution of errors on the screen, in pixels. */
 typedef struct tl_view_errors {
@@ -1246,8 +1256,9 @@ typedef struct tl_preview_options {
     bool perspective;                  /* look from `eye` to `target` instead of straight down */
     /* CRS coordinates (or columns and negative rows where there is no CRS) and height above the datum in metres. */
     double eye[3], target[3];
-    bool view_given; /* false: a view over the whole raster from the south is chosen */
-    double fov;      /* horizontal field of view in degrees, 1 ... 170; 0: 50 */
+    bool view_given;    /* false: a view over the whole raster from the south is chosen */
+    double fov;         /* horizontal field of view in degrees, 1 ... 170; 0: 50 */
+    const char *colour; /* of a perspective: as in tl_view_picture_options */
     bool overwrite;
     const tl_run *run;
 } tl_preview_options;

@@ -325,6 +325,16 @@ static scene_picture paint(const tl_source *dem, const tl_mesh *mesh, const tl_v
     return picture;
 }
 
+static void expect_same_files(const char *a, const char *b)
+{
+    FILE *one = fopen(a, "rb"), *two = fopen(b, "rb");
+    assert_true(one && two);
+    for (int c = 0; c != EOF;)
+        assert_int_equal(c = getc(one), getc(two));
+    fclose(one);
+    fclose(two);
+}
+
 static const tl_view over = {.eye = {11.04, 35.93, 2500}, .pitch = -25, .width = 300, .height = 200, .fov = 70};
 
 static void picturesDoNotDependOnThreads(void **state)
@@ -548,6 +558,92 @@ static void coloursLieWhereTheirRasterDoes(void **state)
     unlink(path);
     finish(elsewhere);
     tl_source_destroy(source);
+    finish(dem);
+}
+
+/* A perspective from high above the middle of quarters that are white and black by turns. */
+static void perspectivesAreDraped(void **state)
+{
+    (void)state;
+    enum { SIDE = 120 };
+    tl_error error = {0};
+    tl_source *dem = hills(true, false, 1);
+    const tl_source_info *info = &dem->info;
+    int64_t width = info->width, height = info->height;
+    float *quarters = malloc((size_t)(width * height) * sizeof *quarters);
+    for (int64_t k = 0; k < width * height; k++)
+        quarters[k] = (2 * (k % width) < width) != (2 * (k / width) < height) ? 255 : 0;
+    tl_source_info board = {.width = width, .height = height, .type = info->type, .name = "board"};
+    board.georef = info->georef;
+    tl_source *source = tl_array_source_create(quarters, &board, &error);
+    char name[64];
+    snprintf(name, sizeof name, "%s", in_folder("quarters.tif"));
+    if (tl_write_grid(source, name, NULL, &error) != TL_OK)
+        fail_msg("%s", error.text);
+    const double *t = info->georef.transform;
+    double x = t[0] + t[1] * .5 * (double)(width - 1), y = t[3] + t[5] * .5 * (double)(height - 1);
+    double metres = fmin((double)width * info->georef.cell_x, (double)height * info->georef.cell_y);
+    tl_preview_options o = {.width = SIDE,
+                            .height = SIDE,
+                            .perspective = true,
+                            .view_given = true,
+                            .eye = {x, y, .8 * metres},
+                            .target = {x, y - .01 * t[5], 0},
+                            .fov = 40,
+                            .colour = name};
+    scene_picture picture = {0};
+    if (scene_perspective(dem, &o, &picture, &error) != TL_OK)
+        fail_msg("%s", error.text);
+    for (int k = 0; k < SIDE * SIDE; k++) {
+        int column = k % SIDE - SIDE / 2, row = k / SIDE - SIDE / 2;
+        if (abs(column) < 5 || abs(row) < 5) /* half a sample between the quarters, and the target's, and slopes */
+            continue;
+        const unsigned char *c = picture.rgba + 4 * k;
+        assert_true((column < 0) != (row < 0) ? c[0] > 120 : c[0] < 120);
+    }
+    scene_picture_finish(&picture);
+    tl_source_destroy(source);
+    free(quarters);
+    unlink(name);
+    finish(dem);
+}
+
+/* Layers by their names: on flat ground the normal is up, the slope 0; and many pictures take what one takes. */
+static void layersAreDraped(void **state)
+{
+    (void)state;
+    tl_error error = {0};
+    tl_source *dem = hills(true, false, 0);
+    scene_rgb c;
+    const char *const kinds[] = {"normal", "slope", "splat"};
+    for (int k = 0; k < 3; k++) {
+        scene_colours *colours = scene_colours_open(kinds[k], dem, NULL, &error);
+        if (!colours)
+            fail_msg("%s", error.text);
+        assert_true(scene_colours_at(colours, 20.5, 18.5, 1, &c));
+        if (k == 0) /* (0, 0, 1) as bytes: 128, 128, 255 */
+            assert_true(fabsf(c.r - .2159F) < .01F && fabsf(c.g - .2159F) < .01F && c.b > .99F);
+        else if (k == 1)
+            assert_true(c.r < .001F && c.g < .001F && c.b < .001F);
+        else
+            assert_true(c.g > c.b);
+        scene_colours_destroy(colours);
+    }
+    tl_mesh *mesh = mesh_of(dem);
+    const tl_view_picture_options o = {.colour = "slope", .overwrite = true};
+    tl_view_painter *painter = tl_view_painter_create(dem, &o, &error);
+    assert_non_null(painter);
+    char one[64], two[64];
+    snprintf(one, sizeof one, "%s", in_folder("one.png"));
+    snprintf(two, sizeof two, "%s", in_folder("two.png"));
+    for (int k = 0; k < 2; k++)
+        assert_int_equal(tl_view_painter_write(painter, mesh, &over, 1, one, &error), TL_OK);
+    assert_int_equal(tl_view_write_picture(mesh, dem, &over, 1, two, &o, &error), TL_OK);
+    expect_same_files(one, two);
+    unlink(one);
+    unlink(two);
+    tl_view_painter_destroy(painter);
+    tl_mesh_destroy(mesh);
     finish(dem);
 }
 
@@ -826,6 +922,8 @@ int main(void)
         cmocka_unit_test(meshesHaveNoCracksOnTheScreen),
         cmocka_unit_test(lightFollowsTheSun),
         cmocka_unit_test(coloursLieWhereTheirRasterDoes),
+        cmocka_unit_test(perspectivesAreDraped),
+        cmocka_unit_test(layersAreDraped),
         cmocka_unit_test(motionBlurIsTheMeanOfTheLight),
         cmocka_unit_test(picturesAndDepthsAreWritten),
         cmocka_unit_test(measuredErrorsAreTheShiftOnTheScreen),

@@ -35,6 +35,9 @@ static tl_status check(const tl_source *beside, const char *path, const tl_previ
         return tl_fail(error, TL_ERROR_ARGUMENT, "%s: the sun's elevation must be within 0...90 degrees", path);
     if (!(o->exaggeration >= 0 && o->exaggeration <= 1e6))
         return tl_fail(error, TL_ERROR_ARGUMENT, "%s: the exaggeration must be within 0...1000000", path);
+    if (o->colour && (o->grey || !o->perspective))
+        return tl_fail(error, TL_ERROR_ARGUMENT, "%s: a raster of colours goes with a perspective that is not grey",
+                       path);
     if (!o->perspective)
         return TL_OK;
     if (beside)

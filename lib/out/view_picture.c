@@ -11,6 +11,12 @@
 
 enum { MOST_VIEWS = 1024 };
 
+struct tl_view_painter {
+    scene_painter *painter;
+    const tl_source *dem;
+    tl_view_picture_options options;
+};
+
 static tl_status write_depth(const scene_painter *painter, const tl_mesh *mesh, const scene_view *view,
                              const tl_view_picture_options *o, tl_error *error)
 {
@@ -48,44 +54,98 @@ static tl_status draw(const scene_painter *painter, const tl_mesh *mesh, const s
 }
 
 /* Opens the views and draws. */
-static tl_status draw_views(const tl_mesh *mesh, const tl_source *dem, const tl_view *views, size_t count,
-                            const tl_view_picture_options *o, tl_output *output, tl_error *error)
+static tl_status draw_views(const tl_view_painter *p, const tl_mesh *mesh, const tl_view *views, size_t count,
+                            tl_output *output, tl_error *error)
 {
     scene_view **opened = calloc(count, sizeof *opened);
     if (!opened)
         return tl_fail_memory(error, "the picture");
-    scene_painter *painter = scene_painter_create(dem, o, error);
-    bool ready = painter != NULL;
+    bool ready = true;
     for (size_t k = 0; k < count && ready; k++)
-        ready = (opened[k] = scene_view_create(&views[k], dem, error)) != NULL;
+        ready = (opened[k] = scene_view_create(&views[k], p->dem, error)) != NULL;
     tl_status status =
-        ready ? draw(painter, mesh, (const scene_view *const *)opened, count, o, output, error) : error->status;
+        ready ? draw(p->painter, mesh, (const scene_view *const *)opened, count, &p->options, output, error)
+              : error->status;
     for (size_t k = 0; k < count; k++)
         scene_view_destroy(opened[k]);
     free(opened);
-    scene_painter_destroy(painter);
     return status;
+}
+
+static tl_status check_depth(const tl_view_picture_options *o, tl_error *error)
+{
+    const tl_format *format = o->depth ? tl_format_of(o->depth) : NULL;
+    if (o->depth && !(format && strcmp(format->ending, "exr") == 0))
+        return tl_fail(error, TL_ERROR_ARGUMENT, "%s: depths go into an .exr", o->depth);
+    return TL_OK;
+}
+
+static tl_status check_count(size_t count, const char *path, tl_error *error)
+{
+    if (count < 1 || count > MOST_VIEWS)
+        return tl_fail(error, TL_ERROR_ARGUMENT, "%s: %zu views were asked for; 1...%d make a picture", path, count,
+                       MOST_VIEWS);
+    return TL_OK;
+}
+
+static tl_status end_output(tl_output *output, tl_status status, tl_error *error)
+{
+    if (status == TL_OK)
+        return tl_output_commit(output, error);
+    tl_output_abort(output);
+    return status;
+}
+
+tl_view_painter *tl_view_painter_create(const tl_source *dem, const tl_view_picture_options *options, tl_error *error)
+{
+    const tl_view_picture_options defaults = {0};
+    options = options ? options : &defaults;
+    if (check_depth(options, error) != TL_OK)
+        return NULL;
+    tl_view_painter *p = calloc(1, sizeof *p);
+    if (!p) {
+        tl_fail_memory(error, "the picture");
+        return NULL;
+    }
+    *p = (tl_view_painter){scene_painter_create(dem, options, error), dem, *options};
+    if (p->painter)
+        return p;
+    free(p);
+    return NULL;
+}
+
+tl_status tl_view_painter_write(const tl_view_painter *painter, const tl_mesh *mesh, const tl_view *views, size_t count,
+                                const char *path, tl_error *error)
+{
+    tl_error local = {0};
+    error = error ? error : &local;
+    if (check_count(count, path, error) != TL_OK)
+        return error->status;
+    tl_output *output = tl_output_open(path, painter->options.overwrite, error);
+    if (!output)
+        return error->status;
+    return end_output(output, draw_views(painter, mesh, views, count, output, error), error);
+}
+
+void tl_view_painter_destroy(tl_view_painter *painter)
+{
+    if (painter)
+        scene_painter_destroy(painter->painter);
+    free(painter);
 }
 
 tl_status tl_view_write_picture(const tl_mesh *mesh, const tl_source *dem, const tl_view *views, size_t count,
                                 const char *path, const tl_view_picture_options *options, tl_error *error)
 {
-    const tl_view_picture_options defaults = {0};
-    options = options ? options : &defaults;
     tl_error local = {0};
     error = error ? error : &local;
-    if (count < 1 || count > MOST_VIEWS)
-        return tl_fail(error, TL_ERROR_ARGUMENT, "%s: %zu views were asked for; 1...%d make a picture", path, count,
-                       MOST_VIEWS);
-    const tl_format *format = options->depth ? tl_format_of(options->depth) : NULL;
-    if (options->depth && !(format && strcmp(format->ending, "exr") == 0))
-        return tl_fail(error, TL_ERROR_ARGUMENT, "%s: depths go into an .exr", options->depth);
-    tl_output *output = tl_output_open(path, options->overwrite, error);
+    if (check_count(count, path, error) != TL_OK || (options && check_depth(options, error) != TL_OK))
+        return error->status;
+    tl_output *output = tl_output_open(path, options && options->overwrite, error); /* before colours are read */
     if (!output)
         return error->status;
-    tl_status status = draw_views(mesh, dem, views, count, options, output, error);
-    if (status == TL_OK)
-        return tl_output_commit(output, error);
-    tl_output_abort(output);
-    return status;
+    tl_view_painter *painter = tl_view_painter_create(dem, options, error);
+    tl_status status = painter ? draw_views(painter, mesh, views, count, output, error) : error->status;
+    tl_view_painter_destroy(painter);
+    return end_output(output, status, error);
 }

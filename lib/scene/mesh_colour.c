@@ -6,6 +6,7 @@
 
 #include <math.h>
 #include <stdlib.h>
+#include <string.h>
 
 enum { LEVELS = 32, MOST_TEXELS = 1 << 24, BANDS = 3, ROWS = 64 };
 
@@ -44,6 +45,73 @@ static int halvings_of(const tl_source_info *info, const tl_run *run)
     while ((double)size_at(info->width, halvings) * (double)size_at(info->height, halvings) > most)
         halvings++;
     return halvings;
+}
+
+/* Layers as colours: shares of a byte of sRGB. */
+
+static scene_rgb colour_of_normal(const float v[4])
+{
+    return (scene_rgb){.5F + .5F * v[0], .5F + .5F * v[1], .5F + .5F * v[2]};
+}
+
+static scene_rgb colour_of_slope(const float v[4])
+{
+    return (scene_rgb){v[0] / 90, v[0] / 90, v[0] / 90};
+}
+
+static scene_rgb colour_of_splat(const float v[4])
+{
+    const scene_rgb kinds[4] = {{.52F, .49F, .46F}, {.66F, .63F, .59F}, {.40F, .48F, .28F}, {.95F, .96F, .97F}};
+    scene_rgb out = {0, 0, 0};
+    for (int k = 0; k < 4; k++)
+        out = (scene_rgb){out.r + v[k] * kinds[k].r, out.g + v[k] * kinds[k].g, out.b + v[k] * kinds[k].b};
+    return out;
+}
+
+enum { CHANNELS = 4 };
+static const struct drape {
+    const char *name; /* of the layer */
+    size_t channels;
+    scene_rgb (*colour)(const float values[CHANNELS]);
+} drapes[] = {{"normal", 3, colour_of_normal}, {"slope", 1, colour_of_slope}, {"splat", 4, colour_of_splat}};
+
+static const struct drape *drape_of(const char *name)
+{
+    for (size_t k = 0; k < sizeof drapes / sizeof *drapes; k++)
+        if (strcmp(drapes[k].name, name) == 0)
+            return &drapes[k];
+    return NULL;
+}
+
+static unsigned char byte_of(float share)
+{
+    return (unsigned char)(fminf(fmaxf(share, 0), 1) * 255 + .5F);
+}
+
+static tl_status read_drape(const struct drape *drape, const tl_source *const *channels, int halvings, sheet *to,
+                            tl_error *error)
+{
+    float *values = tl_alloc_grid(to->width, (int64_t)ROWS * CHANNELS, sizeof *values);
+    tl_status status = values ? TL_OK : tl_fail_memory(error, "the picture's colours");
+    for (int64_t y = 0; y < to->height && status == TL_OK; y += ROWS) {
+        tl_window w = {0, y, to->width, tl_int64_min(ROWS, to->height - y)};
+        int64_t count = w.width * w.height;
+        for (size_t c = 0; c < drape->channels && status == TL_OK; c++)
+            status =
+                tl_source_read(channels[c], channels[c]->info.level - halvings, w, values + (int64_t)c * count, error);
+        for (int64_t k = 0; k < count && status == TL_OK; k++) {
+            float v[CHANNELS] = {0};
+            for (size_t c = 0; c < drape->channels; c++)
+                v[c] = values[(int64_t)c * count + k];
+            scene_rgb colour = drape->colour(v);
+            texel *t = &to->texels[y * to->width + k];
+            *t = (texel){{0}, 0};
+            if (!isnan(v[0]))
+                *t = (texel){{byte_of(colour.r), byte_of(colour.g), byte_of(colour.b)}, 255};
+        }
+    }
+    free(values);
+    return status;
 }
 
 static tl_status read_band(const tl_source *band, int halvings, int which, bool all, sheet *to, tl_error *error)
@@ -92,6 +160,25 @@ static tl_status read_all(scene_colours *c, const char *path, const tl_source *f
                            halvings, grey ? 0 : (int)band - 1, grey, &c->sheets[0], error);
         tl_source_destroy(more);
     }
+    return status;
+}
+
+static tl_status read_layer(scene_colours *c, const struct drape *drape, const tl_source *dem, const tl_run *run,
+                            tl_error *error)
+{
+    int halvings = halvings_of(&dem->info, run);
+    tl_source *channels[CHANNELS] = {NULL};
+    tl_status status = TL_OK;
+    if (!make_sheet(c, size_at(dem->info.width, halvings), size_at(dem->info.height, halvings)))
+        return tl_fail_memory(error, "the picture's colours");
+    for (size_t k = 0; k < drape->channels && status == TL_OK; k++) {
+        channels[k] = tl_layer_create(dem, drape->name, k, &(tl_layer_options){.run = run}, error);
+        status = channels[k] ? TL_OK : TL_ERROR_ARGUMENT;
+    }
+    if (status == TL_OK)
+        status = read_drape(drape, (const tl_source *const *)channels, halvings, &c->sheets[0], error);
+    for (size_t k = 0; k < CHANNELS; k++)
+        tl_source_destroy(channels[k]);
     return status;
 }
 
@@ -165,6 +252,25 @@ static void fill_linear(scene_colours *c)
         c->linear[k] = scene_rgb_of(k).b;
 }
 
+static tl_status open_layer(scene_colours *c, const struct drape *drape, const tl_source *dem, const tl_run *run,
+                            tl_error *error)
+{
+    tl_status status = find_places(c, &dem->info, &dem->info, halvings_of(&dem->info, run), drape->name, error);
+    return status == TL_OK ? read_layer(c, drape, dem, run, error) : status;
+}
+
+static tl_status open_raster(scene_colours *c, const char *path, const tl_source *dem, const tl_run *run,
+                             tl_error *error)
+{
+    tl_source *first = tl_open_with(path, &(tl_dem_options){.band = 1, .run = run}, error);
+    tl_status status =
+        first ? find_places(c, &first->info, &dem->info, halvings_of(&first->info, run), path, error) : TL_ERROR_DATA;
+    if (status == TL_OK)
+        status = read_all(c, path, first, run, error);
+    tl_source_destroy(first);
+    return status;
+}
+
 scene_colours *scene_colours_open(const char *path, const tl_source *dem, const tl_run *run, tl_error *error)
 {
     scene_colours *c = calloc(1, sizeof *c);
@@ -174,14 +280,10 @@ scene_colours *scene_colours_open(const char *path, const tl_source *dem, const 
     }
     scene_encode_prepare();
     fill_linear(c);
-    tl_source *first = tl_open_with(path, &(tl_dem_options){.band = 1, .run = run}, error);
-    tl_status status =
-        first ? find_places(c, &first->info, &dem->info, halvings_of(&first->info, run), path, error) : TL_ERROR_DATA;
-    if (status == TL_OK)
-        status = read_all(c, path, first, run, error);
+    const struct drape *drape = drape_of(path);
+    tl_status status = drape ? open_layer(c, drape, dem, run, error) : open_raster(c, path, dem, run, error);
     if (status == TL_OK)
         status = make_means(c, error);
-    tl_source_destroy(first);
     if (status == TL_OK)
         return c;
     scene_colours_destroy(c);

@@ -7,8 +7,9 @@
 
 typedef struct scene_colours scene_colours;
 
-/* Reads a raster of bytes: the bands red, green and blue, or one for grey. It must be in dem's CRS. Of one that is
- * large, coarser levels are read: it takes at most 90 MB, and at most a quarter of the run's memory. */
+/* Reads a raster of bytes: the bands red, green and blue, or one for grey; it must be in dem's CRS. Or makes a layer of
+ * dem: normal, slope, splat. Of what is large, coarser levels are read: it takes at most 90 MB, and at most a quarter
+ * of the run's memory. */
 scene_colours *scene_colours_open(const char *path, const tl_source *dem, const tl_run *run, tl_error *error);
 void scene_colours_destroy(scene_colours *colours);
 

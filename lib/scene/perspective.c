@@ -4,6 +4,7 @@
 #include "lib/base/size.h"
 #include "lib/scene/camera.h"
 #include "lib/scene/light.h"
+#include "lib/scene/mesh_colour.h"
 #include "lib/scene/render.h"
 #include "lib/scene/tile_grid.h"
 #include "lib/scene/zbuffer.h"
@@ -34,6 +35,7 @@ typedef struct scene {
     scene_ground ground;
     scene_camera camera; /* its pixels are fragments */
     scene_palette palette;
+    scene_colours *colours; /* NULL: by height */
     scene_light light;
     double low, high; /* of all ground, exaggerated metres */
     double foot;
@@ -460,6 +462,22 @@ static scene_rgb sky(const scene *s, double x, double y)
     return sine > 0 ? scene_mix(horizon, zenith, sine * (2 - sine)) : scene_mix(horizon, below, -sine);
 }
 
+/* The colour that lies on the ground at a fragment, `x` and `y` of them from straight ahead. */
+static scene_rgb ground_colour(const scene *s, const scene_fragment *f, double x, double y)
+{
+    const scene_camera *c = &s->camera;
+    const tl_source_info *info = &s->pyramid.source->info;
+    double a = x / c->focal, b = y / c->focal, ahead = 1 / (double)f->nearness;
+    double east = c->eye[0] + ahead * (c->right[0] * a + c->down[0] * b + c->ahead[0]),
+           north = c->eye[1] + ahead * (c->right[1] * a + c->down[1] * b + c->ahead[1]);
+    double pixel = SUPER * ahead * sqrt(1 + a * a + b * b) / c->focal;
+    scene_rgb colour;
+    if (s->colours && scene_colours_at(s->colours, east / s->ground.cell_x + (double)(info->width - 1) / 2,
+                                       (double)(info->height - 1) / 2 - north / s->ground.cell_y, pixel, &colour))
+        return colour;
+    return scene_palette_at(&s->palette, f->height);
+}
+
 static scene_rgb fragment_colour(const scene *s, const scene_fragment *f, double x, double y)
 {
     if (!(f->nearness > 0))
@@ -470,7 +488,7 @@ static scene_rgb fragment_colour(const scene *s, const scene_fragment *f, double
         const float steep = 1e3f;
         colour = scene_lit(&s->light, stone, -f->east * steep, -f->north * steep, 1);
     } else {
-        colour = scene_lit(&s->light, scene_palette_at(&s->palette, f->height), f->east, f->north, 1);
+        colour = scene_lit(&s->light, ground_colour(s, f, x, y), f->east, f->north, 1);
     }
     if (s->haze == 0)
         return colour;
@@ -652,6 +670,8 @@ static tl_status prepare(scene *s, const tl_preview_options *o, tl_error *error)
     bool given = o->sun_azimuth != 0 || o->sun_elevation != 0;
     scene_light_init(&s->light, given ? o->sun_azimuth : 235, given ? o->sun_elevation : 35);
     scene_encode_prepare();
+    if (o->colour && !(s->colours = scene_colours_open(o->colour, s->pyramid.source, o->run, error)))
+        return error->status;
     return choose_colours(s, o, error);
 }
 
@@ -660,6 +680,7 @@ static void scene_finish(scene *s)
     for (size_t k = 0; k < s->tile_count; k++)
         free(s->tiles[k].heights);
     free(s->tiles);
+    scene_colours_destroy(s->colours);
     scene_pyramid_finish(&s->pyramid);
     free(s);
 }

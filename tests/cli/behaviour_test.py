@@ -921,6 +921,12 @@ def pictures_take_colours_of_rasters(case):
     expect("--grey" in said, said)
     said = case.run(*view, "--picture", "a.png", "--colour", "none.tif", status=1).err
     expect("none.tif" in said and not os.path.exists(case.path("a.png")), said)
+    small = ("preview", EXAMPLE, "--width", 200, "--height", 120, "-q")
+    for k, more in enumerate([(), ("--colour", "hypsometric"), ("--colour", EXAMPLE), ("--colour", "splat")]):
+        case.run(*small, "--perspective", *more, "-o", f"p{k}.png")
+    p = [open(case.path(f"p{k}.png"), "rb").read() for k in range(4)]
+    expect(p[0] == p[1] and len(set(p)) == 3, "colours of perspectives")
+    expect("--perspective" in case.run(*small, "--colour", "splat", "-o", "q.png", status=2).err, "a hillshade took colours")
 
 
 def inputs_are_not_overwritten(case):
