@@ -11,6 +11,7 @@ trap 'rm -rf "$work"' EXIT
 
 if [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null; then
     packages="gdal-bin python3-gdal python3-numpy openexr openimageio-tools blender assimp-utils"
+    packages="$packages parallel openmpi-bin slurm-wlm munge"
     command -v npm >/dev/null || packages="$packages nodejs npm"
     for package in $packages; do
         dpkg-query -W -f '${Status}' "$package" 2>/dev/null | grep -q '^install ok' ||
@@ -29,4 +30,9 @@ else
     meson setup "$work/build" "$here" -Dtests=false >"$work/build.log" && ninja -C "$work/build" --quiet
     program=$work/build/cmd/talus
 fi
-TALUS_NPM=$work/npm/node_modules python3 "$here/tests/judges/formats.py" "$program" "$work"
+status=0
+TALUS_NPM=$work/npm/node_modules python3 "$here/tests/judges/formats.py" "$program" "$work" || status=1
+# Pyramids of tiles in parts and after kills: GNU parallel, Open MPI, a Slurm of its own.
+mkdir "$work/tiles"
+python3 "$here/tests/judges/tiles.py" "$program" "$work/tiles" || status=1
+exit $status
