@@ -147,7 +147,7 @@ static void close_ground(tl_source *source, float *heights)
 static tl_tiles_options options_of(const ground *g, const tl_source *source)
 {
     int deepest = g->last_level ? g->last_level : scene_geodetic_level(&source->info);
-    bool whole = g->last_level > 0 || g->holes == 1;
+    bool whole = g->last_level > 0;
     return (tl_tiles_options){.max_error = g->max_error,
                               .first_level = whole || deepest < 4 ? 0 : deepest - 4,
                               .last_level = g->last_level,

@@ -4,6 +4,7 @@
 --update pins the heights that are made now, in tests/golden/heights.sha256.
 """
 import array
+import gzip
 import hashlib
 import http.client
 import json
@@ -13,6 +14,7 @@ import pty
 import re
 import resource
 import select
+import shutil
 import signal
 import struct
 import subprocess
@@ -1035,6 +1037,89 @@ def man_page_knows_every_option(case):
             expect(f"--{option}*" in page, f"--{option} of {name} is not in the man page")
 
 
+# ---- tiles ----
+
+def torn_tiles(folder):
+    return [name for name in snapshot(folder) if name.endswith(".terrain") and not is_gzip(os.path.join(folder, name))]
+
+
+def is_gzip(path):
+    """Whether a file is one whole gzip stream: its checksum is at its end."""
+    try:
+        with gzip.open(path) as file:
+            return len(file.read()) > 88
+    except (OSError, EOFError):
+        return False
+
+
+def tiles_survive_kills(case):
+    """Killed at some moments, and gone on with; a run of its own has made what comes out."""
+    words = ("tiles", EXAMPLE, "-e", 5, "-l", "8..12", "-q")
+    started = time.monotonic()
+    case.run(*words, "-o", "whole")
+    seconds = time.monotonic() - started
+    for share in (0.1, 0.5, 0.9):
+        for again in (1, 0.5):
+            process = case.start(*words, "--resume", "-o", "killed")
+            time.sleep(share * again * seconds)
+            process.kill()
+            process.communicate()
+            if os.path.exists(case.path("killed")):
+                expect(not torn_tiles(case.path("killed")), f"{share}: {torn_tiles(case.path('killed'))}")
+        case.run(*words, "--resume", "-o", "killed")
+        expect(snapshot(case.path("killed")) == snapshot(case.path("whole")), f"killed after {share}: another tree")
+        shutil.rmtree(case.path("killed"))
+
+
+def tiles_go_on_after_an_interruption(case):
+    words = ("tiles", EXAMPLE, "-e", 5, "-l", "8..13")
+    case.run(*words, "-q", "-o", "whole")
+    for number in (signal.SIGINT, signal.SIGTERM):
+        process = case.start(*words, "--progress", "json", "-o", "stopped", preexec_fn=default_signals)
+        process.stderr.readline()
+        process.stderr.readline()
+        process.send_signal(number)
+        _, said = process.communicate(timeout=120)
+        expect(process.returncode in (0, 130), f"exit status {process.returncode}")
+        if process.returncode:
+            expect(said.decode().endswith("talus: interrupted\n"), said)
+            case.run(*words, "-q", "--resume", "-o", "stopped")
+        expect(snapshot(case.path("stopped")) == snapshot(case.path("whole")), "another tree")
+        shutil.rmtree(case.path("stopped"))
+
+
+def tiles_tell_a_full_disk(case):
+    """One line, and what is there can be gone on with."""
+    words = ("tiles", EXAMPLE, "-e", 5, "-l", "9..12", "-q")
+    case.run(*words, "-o", "whole")
+    size = sum(os.path.getsize(os.path.join(where, name)) for where, _, names in os.walk(case.path("whole")) for name in names)
+    for share in (0.01, 0.4, 0.8):
+        _, said = mounted_run(case, int(size * share) // 4096 * 4096 + 4096, *words, "-o", "made")
+        expect(re.fullmatch(r"talus: made[^:\n]*: cannot (write|make): No space left on device\n", said), said)
+
+
+def tiles_by_parts_are_the_same(case):
+    """By hand, under GNU parallel and under Open MPI, where these are installed."""
+    words = ("tiles", EXAMPLE, "-e", 5, "-l", "12..14", "-q", "-t", 1)
+    case.run(*words, "-o", "whole")
+    whole = snapshot(case.path("whole"))
+    program = [case.program, *map(str, words)]
+    runs = {"hand": [[*program, "-o", "made", "--shard", f"{k}/3"] for k in (2, 0, 1)]}
+    if shutil.which("parallel"):
+        runs["parallel"] = [["parallel", "-j", "2", *program, "-o", "made", "--shard", "{}", ":::", "0/2", "1/2"]]
+    if shutil.which("mpirun"):
+        root = ["--allow-run-as-root"] if os.getuid() == 0 else []
+        runs["mpirun"] = [["mpirun", *root, "--oversubscribe", "-n", "2", *program, "-o", "made", "--shard", "auto"]]
+    for name, commands in runs.items():
+        for command in commands:
+            done = subprocess.run(command, cwd=case.folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=120,
+                                  check=False)
+            expect(done.returncode == 0, f"{name}: {done.stdout.decode()}")
+        case.run(*words, "--finish", "-o", "made")
+        expect(snapshot(case.path("made")) == whole, f"{name}: another tree")
+        shutil.rmtree(case.path("made"))
+
+
 # ---- memory ----
 
 def memory_does_not_grow_with_the_output(case):
@@ -1191,6 +1276,7 @@ TESTS = [
     area_means_stay_on_their_footprint,
     glb_is_in_metres, frames_agree, simplify_keeps_its_word, diagonals_are_turned, codings_keep_the_bound, layers_are_written_beside, inputs_are_not_overwritten, layers_are_refused_before_the_work, vertices_tell_where_they_came_from,
     flights_tell_how_far_ground_jumps, pictures_take_colours_of_rasters,
+    tiles_survive_kills, tiles_go_on_after_an_interruption, tiles_tell_a_full_disk, tiles_by_parts_are_the_same,
     manuals_show_what_works, man_page_knows_every_option,
     memory_does_not_grow_with_the_output, memory_stays_within_what_is_given, bad_files_end_with_one_line,
     gdal_reads_the_geotiff, gdal_places_the_example, openexr_reads_the_exr, openimageio_agrees_on_the_range,
