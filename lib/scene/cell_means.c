@@ -1,5 +1,6 @@
 #include "lib/scene/cell_means.h"
 
+#include "fbm/weights.h"
 #include "lib/base/error.h"
 #include "lib/base/size.h"
 
@@ -108,21 +109,45 @@ static tl_status means_of(const scene_cell_means *m, const scene_chain *chain, p
 
 /* ---- The response ------------------------------------------------------------------------------ */
 
-enum { REACH = SCENE_MEANS_REACH, SPREAD = 6, SIDE = 2 * SPREAD + 1, ROUNDS = 60 };
+/* Exponent k of the inverses: closer where they are small, for there the response changes most. */
+static double exponent_of(int k)
+{
+    const double part = (double)k / (SCENE_MEANS_EXPONENTS - 1);
+    return FBM_HURST_MIN + (FBM_HURST_MAX - FBM_HURST_MIN) * part * part;
+}
 
-/* Heights at the impulse's row for the window's cells: one point is 1. */
-static tl_status impulse_response(const scene_cell_means *m, const scene_chain *chain, int64_t row,
+static double place_of(double hurst)
+{
+    const double part = sqrt(fmax((hurst - FBM_HURST_MIN) / (FBM_HURST_MAX - FBM_HURST_MIN), 0));
+    return fmin((SCENE_MEANS_EXPONENTS - 1) * part, SCENE_MEANS_EXPONENTS - 1);
+}
+
+enum {
+    REACH = SCENE_MEANS_REACH,
+    SPREAD = 6,
+    SIDE = 2 * SPREAD + 1,
+    ROUNDS = 60,
+    TAPS = (2 * REACH + 1) * (2 * REACH + 1)
+};
+
+/* Heights at the impulse's row for the window's cells: one point is 1. Where the chain asks for it, of one exponent. */
+static tl_status impulse_response(const scene_cell_means *m, const scene_chain *chain, int64_t row, double hurst,
                                   double response[SIDE][SIDE], const char *name, tl_error *error)
 {
     fbm_window window = dense(-SPREAD, row - SPREAD, SIDE, SIDE);
     scene_chain_target cells = target_of(m->level, finer(window, m->level), NULL);
     fbm_window support = scene_chain_support(chain, &cells);
-    points p = {support, calloc(support.width * support.height, sizeof(float)), NULL};
-    if (!p.heights)
+    size_t count = support.width * support.height;
+    float *heights = calloc(3 * count, sizeof *heights); /* and planes behind them: no noise */
+    if (!heights)
         return tl_fail_memory(error, name);
-    p.heights[(size_t)(row - support.j) * support.width + (size_t)-support.i] = 1;
+    scene_planes planes = {support, {[SCENE_STRENGTH] = heights + count, [SCENE_HURST] = heights + 2 * count}};
+    for (size_t k = 0; k < count; k++)
+        planes.of[SCENE_HURST][k] = (float)hurst;
+    points p = {support, heights, chain->placed ? &planes : NULL};
+    heights[(size_t)(row - support.j) * support.width + (size_t)-support.i] = 1;
     tl_status status = means_of(m, chain, &p, window, response[0], name, error);
-    free(p.heights);
+    free(heights);
     return status;
 }
 
@@ -158,17 +183,21 @@ static void invert(double response[SIDE][SIDE], double inverse[2 * REACH + 1][2 
 tl_status scene_cell_means_measure(const scene_chain *chain, int64_t row, int levels, scene_cell_means *out,
                                    const char *name, tl_error *error)
 {
-    *out = (scene_cell_means){.level = levels < SCENE_MEANS_LEVEL ? levels : SCENE_MEANS_LEVEL};
+    *out =
+        (scene_cell_means){.level = levels < SCENE_MEANS_LEVEL ? levels : SCENE_MEANS_LEVEL, .placed = chain->placed};
     scene_chain smooth = *chain; /* shares what it points to */
-    smooth.mapped = smooth.placed = false;
+    smooth.mapped = smooth.placed;
     for (int l = 0; l <= SCENE_LEVEL_MAX; l++)
         smooth.steps[l].amplitude = 0;
     for (int k = 0; k < 2; k++)
         smooth.row_steps[k].amplitude = 0;
     double response[SIDE][SIDE];
-    tl_status status = impulse_response(out, &smooth, row, response, name, error);
-    if (status == TL_OK)
-        invert(response, out->inverse);
+    tl_status status = TL_OK;
+    for (int k = 0; status == TL_OK && k < (out->placed ? SCENE_MEANS_EXPONENTS : 1); k++) {
+        status = impulse_response(out, &smooth, row, exponent_of(k), response, name, error);
+        if (status == TL_OK)
+            invert(response, out->inverses[k]);
+    }
     return status;
 }
 
@@ -188,16 +217,34 @@ static void errors_of(const scene_patch *patch, fbm_window window, double *means
     }
 }
 
+/* The inverse at a point: the share of the one before and of the one behind its exponent. */
+static const double *inverse_at(const scene_cell_means *m, const scene_planes *planes, int64_t i, int64_t j,
+                                double room[TAPS])
+{
+    if (!m->placed)
+        return m->inverses[0][0];
+    const fbm_window *w = &planes->window;
+    double hurst = (double)planes->of[SCENE_HURST][(size_t)(j - w->j) * w->width + (size_t)(i - w->i)];
+    double place = place_of(hurst);
+    int at = place < SCENE_MEANS_EXPONENTS - 1 ? (int)place : SCENE_MEANS_EXPONENTS - 2;
+    const double *before = m->inverses[at][0], *behind = m->inverses[at + 1][0];
+    for (int k = 0; k < TAPS; k++)
+        room[k] = before[k] + (place - at) * (behind[k] - before[k]);
+    return room;
+}
+
 static void choose_points(const scene_cell_means *m, const scene_patch *patch, const double *errors, points *p)
 {
     fbm_window w = p->window;
     size_t stride = w.width + 2 * REACH;
+    double room[TAPS];
     for (size_t y = 0; y < w.height; y++)
         for (size_t x = 0; x < w.width; x++) {
             double sum = (double)patch_height(patch, w.i + (int64_t)x, w.j + (int64_t)y);
+            const double *inverse = inverse_at(m, p->planes, w.i + (int64_t)x, w.j + (int64_t)y, room) + TAPS - 1;
             for (size_t v = 0; v <= 2 * REACH; v++)
                 for (size_t u = 0; u <= 2 * REACH; u++)
-                    sum += m->inverse[2 * REACH - v][2 * REACH - u] * errors[(y + v) * stride + x + u];
+                    sum += *inverse-- * errors[(y + v) * stride + x + u];
             p->heights[y * w.width + x] = (float)sum;
         }
 }

@@ -11,11 +11,14 @@
 #include "lib/scene/chain.h"
 #include "lib/scene/patch.h"
 
-enum { SCENE_MEANS_REACH = 3, SCENE_MEANS_LEVEL = 4 };
+enum { SCENE_MEANS_REACH = 3, SCENE_MEANS_LEVEL = 4, SCENE_MEANS_EXPONENTS = 9 };
 
 typedef struct scene_cell_means {
     int level; /* at which means are taken, 1 ... SCENE_MEANS_LEVEL */
-    double inverse[2 * SCENE_MEANS_REACH + 1][2 * SCENE_MEANS_REACH + 1];
+    /* The first, or where exponents follow the place those of exponents from FBM_HURST_MIN to FBM_HURST_MAX, between
+     * which a point's own is linear. */
+    bool placed;
+    double inverses[SCENE_MEANS_EXPONENTS][2 * SCENE_MEANS_REACH + 1][2 * SCENE_MEANS_REACH + 1];
 } scene_cell_means;
 
 /* Measures the response of the chain, by an impulse at a row of level 0, for means at level min(levels, 4). */
