@@ -30,7 +30,7 @@ enum {
     ROW = SCENE_BLOCK_VERTICES,
     ROOT_LATTICE = 2,
     METADATA_LEVELS = 10,
-    WORKER_BYTES = 80 << 20,
+    WORKER_BYTES = 80 << 20, /* 65 MB are measured */
     /* Vertices around what is known take heights from there, so that the step down to the height outside is beyond what
      * is known, on every lattice. More are read around a block, so that this comes out alike in all blocks. */
     GROWTH = 4,
