@@ -19,13 +19,12 @@
 #include <unistd.h>
 
 #ifdef TL_HAVE_MICROHTTPD
-enum { PORT = 8080, MOST_WORKERS = 4, QUEUE = 64 };
+enum { PORT = 8080, MOST_WORKERS = 4 };
 
 typedef struct server {
     char root[PATH_MAX];   /* without links and dots */
     char viewer[PATH_MAX]; /* of the page; "" where the folder brings its own, or there is none */
     int port;
-    bool quiet;
 } server;
 
 /* ---- Files ---- */
@@ -220,7 +219,7 @@ static int run_serve(const command *self, int argc, const char **argv, bool help
     const option_group groups[] = {{"Serving", options}, {0}};
     arguments rest;
     int status;
-    server here = {.quiet = shared.quiet};
+    server here = {.port = 0};
     if (!command_begin(self, argc, argv, help, groups, 1, &rest, &status))
         return status;
     bool good =

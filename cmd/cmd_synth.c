@@ -631,7 +631,8 @@ static bool synth_ok(const settings *set)
 static bool take_record(const command *self, int argc, const char **argv, const option_group *groups, settings *set,
                         arguments *rest)
 {
-    bool good = !set->same_as || same_as_parse(self, set->same_as, argc, argv, groups, rest);
+    bool good = !set->same_as || (same_as_parse(self, set->same_as, argc, argv, groups, rest) &&
+                                  !same_as_is_output(set->same_as, &set->common));
     set->record = rest->record;
     return good;
 }

@@ -101,8 +101,9 @@ static void report(const settings *set, const tl_tiles_report *r, double seconds
         if (r->levels[k].tiles)
             command_say(&set->common, "level %-3d %8llu tiles %10llu triangles %11llu bytes, error <= %.4g m", k,
                         (unsigned long long)r->levels[k].tiles, (unsigned long long)r->levels[k].triangles,
-                        (unsigned long long)r->levels[k].bytes, r->levels[k].error);
-    command_say(&set->common, "the DEM's samples are within %.4g m of the deepest lattice's surface", r->resampling);
+                        (unsigned long long)r->levels[k].bytes, r->levels[k].error + r->resampling);
+    command_say(&set->common, "of each error, %.4g m are between the DEM's samples and the deepest lattice's surface",
+                r->resampling);
     command_say(&set->common, "%s: %llu tiles, %llu bytes, %.2f s%s", folder, (unsigned long long)tiles,
                 (unsigned long long)bytes, seconds, r->complete ? "" : "; not complete until --finish");
 }
@@ -161,11 +162,13 @@ static int run_tiles(const command *self, int argc, const char **argv, bool help
         {"format", 'f', OPTION_CHOICE, &set.format, NULL, "KIND", "of the tiles (default: quantized-mesh)", 0, 0,
          formats},
         {"error", 'e', OPTION_NUMBER, &set.max_error, NULL, "METRES",
-         "largest error of the deepest level, 0.001...1e6; twice as much a level above (default: a quarter of what "
-         "globes take the level for)",
+         "largest error of the deepest level, 0.001...1e6, against the lattice that the DEM is resampled to; twice as "
+         "much "
+         "a level above (default: a quarter of what globes take the level for)",
          0.001, 1e6, NULL},
         {"levels", 'l', OPTION_TEXT, &set.levels, NULL, "A..B",
-         "of tiles (default: from 0 to the first whose cells are no larger than the DEM's)", 0, 0, NULL},
+         "of tiles (default: from 0 to the first whose cells are, at the equator, no larger than the DEM's in metres)",
+         0, 0, NULL},
         {"no-normals", 0, OPTION_FLAG, &set.no_normals, NULL, NULL, "leave the vertices' normals away", 0, 0, NULL},
         {"outside", 0, OPTION_NUMBER, &set.outside, NULL, "METRES",
          "height of ground that the DEM does not know (default: 0)", -1e5, 1e5, NULL},

@@ -43,12 +43,11 @@ static bool is_one_of(const char *name, const char *const *names)
     return *names;
 }
 
-/* Those that change no byte of the output. */
-static bool leaves_no_trace(const option *o)
+bool record_leaves_out(const char *name)
 {
     static const char *const names[] = {"output", "overwrite", "threads", "memory", "progress",
                                         "quiet",  "verify",    "same-as", "json",   NULL};
-    return is_one_of(o->name, names);
+    return is_one_of(name, names);
 }
 
 static bool names_a_file(const option *o)
@@ -147,13 +146,17 @@ char *record_make(const char *command, const option *const *options, size_t coun
     for (size_t k = 0; k < count; k++) {
         option_value now = {.integers = {0}};
         memcpy(&now, options[k]->target, record_value_size(options[k]));
-        if (leaves_no_trace(options[k]) || is_default(options[k], &now, &before[k]))
+        if (record_leaves_out(options[k]->name) || is_default(options[k], &now, &before[k]))
             continue;
         put(&to, " --");
         put(&to, options[k]->name);
         put_value(&to, options[k], &now);
     }
-    for (size_t k = 0; k < rest->count; k++)
-        put_word(&to, without_folders(rest->names[k]));
+    for (size_t k = 0; k < rest->count; k++) {
+        const char *name = without_folders(rest->names[k]);
+        char path[LIMIT];
+        snprintf(path, sizeof path, "%s%s", *name == '-' ? "./" : "", name); /* or it would be an option */
+        put_word(&to, path);
+    }
     return to.full ? NULL : strdup(to.text);
 }

@@ -21,6 +21,8 @@ typedef union option_value {
 
 /* Bytes of a target. */
 size_t record_value_size(const option *o);
+/* Whether an option of this name changes no byte of the output, so that records do not hold it. */
+bool record_leaves_out(const char *name);
 /* Takes down what the targets hold before parsing. */
 void record_values(const option *const *options, size_t count, option_value *out);
 /* To be freed; NULL when out of memory, or where it would be longer than 4000 bytes. */

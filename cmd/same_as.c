@@ -1,9 +1,12 @@
 #include "cmd/same_as.h"
 
+#include "cmd/record.h"
+
 #include <popt.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/stat.h>
 #include <unistd.h>
 
 /* The parameter `name` of a file that talus wrote, to be freed; NULL, told, where there is none. */
@@ -11,6 +14,11 @@ static char *read_parameter(const char *path, const char *name)
 {
     tl_error error;
     char *value = NULL;
+    const tl_format *format = tl_format_of(path);
+    if (format && format->mesh) {
+        complain("%s: --same-as takes .exr, .tif, .png, .r16 and .raw; a mesh does not record enough", path);
+        return NULL;
+    }
     tl_source *source = tl_open(path, &error);
     if (!source) {
         complain("%s", error.text);
@@ -73,6 +81,25 @@ static void free_words(words *w)
         free(w->owned[k]);
     free(w->owned);
     free(w->list);
+}
+
+/* Anyone may have written the file: what says where to write, and what to replace, is the command line's alone. */
+static bool is_sound(const words *w, const char *same_as)
+{
+    for (int k = 1; k < w->count; k++) {
+        char name[64];
+        const char *word = w->list[k];
+        bool number = word[0] == '-' && word[1] && strchr("0123456789.", word[1]);
+        if (word[0] != '-' || number)
+            continue;
+        snprintf(name, sizeof name, "%s", word + strspn(word, "-"));
+        name[strcspn(name, "=")] = 0;
+        if (strncmp(word, "--", 2) != 0 || !*name || record_leaves_out(name)) {
+            complain("%s: its record has %.60s, which talus does not record; it is not taken", same_as, word);
+            return false;
+        }
+    }
+    return true;
 }
 
 static bool split(const char *record, const char *same_as, words *out)
@@ -141,7 +168,7 @@ bool same_as_parse(const command *self, const char *same_as, int argc, const cha
     words recorded = {0};
     char *path = strdup(same_as); /* parsing again frees the text */
     char *record = path ? read_parameter(path, "command") : NULL;
-    bool good = record && split(record, path, &recorded);
+    bool good = record && split(record, path, &recorded) && is_sound(&recorded, path);
     if (good && strcmp(recorded.list[0], self->name) != 0) {
         complain("%s: was made by talus %s, not by talus %s", path, recorded.list[0], self->name);
         good = false;
@@ -151,6 +178,16 @@ bool same_as_parse(const command *self, const char *same_as, int argc, const cha
     free(record);
     free(path);
     return good;
+}
+
+bool same_as_is_output(const char *same_as, const common *shared)
+{
+    struct stat a, b;
+    bool same = same_as && shared->output && stat(same_as, &a) == 0 && stat(shared->output, &b) == 0 &&
+                a.st_dev == b.st_dev && a.st_ino == b.st_ino;
+    if (same)
+        complain("%s: is the file to be made again; name another output", shared->output);
+    return same;
 }
 
 /* ---- Comparing ---- */

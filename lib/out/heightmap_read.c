@@ -160,7 +160,7 @@ static bool take_numbers(heightmap *self, json_t *json)
     info->type = type && strcmp(type, "point") == 0 ? TL_RASTER_POINT : TL_RASTER_AREA;
     double furthest = fabs(self->code.offset) + 65535 * fabs(self->code.scale);
     return info->width > 0 && info->height > 0 && info->width <= INT32_MAX && info->height <= INT32_MAX &&
-           furthest <= 3e38;
+           (double)info->width * (double)info->height < 0x1p60 && furthest <= 3e38;
 }
 
 static tl_status take_place(heightmap *self, json_t *json, tl_error *error)

@@ -56,6 +56,7 @@ typedef struct job {
     scene_geodetic *lattice;
     int deepest;      /* lattice, and tile level */
     double max_error; /* of the deepest level */
+    uint32_t sum;     /* of some of the source's heights */
     out_tile_list list;
     tl_tiles_report report;
     /* of the lattice in work */
@@ -324,16 +325,18 @@ static tl_status write_tile(const job *j, const out_piece_tile *tile, const out_
 }
 
 /* How far rounding places moves a surface up or down: half a step of 32767 over the tile, along its steepest edge. */
-static double shift_of(const job *j, const scene_tile_mesh *mesh)
+static double shift_of(const worker *w, int x, int y)
 {
-    float outside = (float)j->options->outside;
+    const scene_tile_mesh *mesh = &w->mesh;
+    const unsigned char *known = w->known + (SCENE_RIM + y) * ROW + SCENE_RIM + x;
     double steepest = 0; /* squared */
     for (size_t k = 0; k < 3 * mesh->triangle_count; k++) {
         const struct scene_tile_vertex *a = &mesh->vertices[mesh->indices[k]],
                                        *b = &mesh->vertices[mesh->indices[k % 3 == 2 ? k - 2 : k + 1]];
         double i = a->i - b->i, l = a->j - b->j, rise = (double)a->z - (double)b->z;
         double slope = rise * rise / (i * i + l * l);
-        if (slope > steepest && a->z != outside && b->z != outside) /* the wall around the source is no ground */
+        /* the wall around what is known is no ground */
+        if (slope > steepest && known[a->j * ROW + a->i] && known[b->j * ROW + b->i])
             steepest = slope;
     }
     return sqrt(steepest) * mesh->cells / 32767;
@@ -369,7 +372,7 @@ static tl_status make_tile(const job *j, worker *w, const double *limits, const 
     /* what the limits let pass, with the sag of the largest triangles, is below the bound */
     double left_out = fmin(w->mesh.error + sag(j->level, SCENE_TILE_SIZES - 1), bound_of(j, tile->level));
     tile->error = fmax(left_out, w->mesh.lost + sag(j->level, 0));
-    tile->error += quantum / 2 + shift_of(j, &w->mesh);
+    tile->error += quantum / 2 + shift_of(w, x, y);
     return write_tile(j, tile, &w->buffer, error);
 }
 
@@ -692,6 +695,26 @@ static tl_status write_text(const char *folder, const char *name, const char *te
     return status;
 }
 
+/* Of some rows of the heights: another model of the same shape is noticed without reading it all. */
+static tl_status sum_rows(const tl_source *source, uint32_t *sum, tl_error *error)
+{
+    enum { ROWS = 16 };
+    const tl_source_info *info = &source->info;
+    float *row = tl_alloc((size_t)info->width, sizeof *row);
+    tl_status status = row ? TL_OK : tl_fail_memory(error, info->name);
+    *sum = 0;
+    for (int64_t k = 0; k < ROWS && status == TL_OK; k++) {
+        const tl_window window = {0, (2 * k + 1) * info->height / (2 * ROWS), info->width, 1};
+        status = tl_source_read(source, info->level, window, row, error);
+        for (int64_t x = 0; status == TL_OK && x < info->width; x++)
+            row[x] = isnan(row[x]) ? NAN : row[x]; /* one kind of them */
+        if (status == TL_OK)
+            *sum = libdeflate_crc32(*sum, row, (size_t)info->width * sizeof *row);
+    }
+    free(row);
+    return status;
+}
+
 /* What all who work on a folder must agree on. */
 static char *describe_job(const job *j)
 {
@@ -705,6 +728,7 @@ static char *describe_job(const job *j)
         json_array_append_new(transform, json_real(info->georef.transform[k]));
     json_object_set_new(root, "transform", transform);
     json_object_set_new(root, "crs", json_string(tl_crs_name(info->georef.crs)));
+    json_object_set_new(root, "rows", json_integer(j->sum));
     json_t *parameters = json_object();
     for (size_t k = 0; k < info->parameter_count; k++)
         json_object_set_new(parameters, info->parameters[k].name, json_string(info->parameters[k].value));
@@ -917,7 +941,9 @@ static void foresee(job *j)
         int64_t across = floor_div(w.x + w.width - 1, cells) - floor_div(w.x, cells) + 1;
         int64_t down = floor_div(w.y + w.height - 1, cells) - floor_div(w.y, cells) + 1;
         j->report.levels[level].tiles =
-            (uint64_t)(tl_int64_min(across, INT64_C(2) << level) * tl_int64_min(down, INT64_C(1) << level));
+            level == 0
+                ? 2
+                : (uint64_t)(tl_int64_min(across, INT64_C(2) << level) * tl_int64_min(down, INT64_C(1) << level));
     }
 }
 
@@ -928,6 +954,9 @@ static tl_status work(job *j, tl_error *error)
         foresee(j);
         return status;
     }
+    status = sum_rows(j->source, &j->sum, error);
+    if (status != TL_OK)
+        return status;
     char *text = describe_job(j);
     if (text && (j->options->resume || j->options->finish) && is_complete(j, text)) {
         free(text);
@@ -942,6 +971,12 @@ static tl_status work(job *j, tl_error *error)
     j->level = j->deepest;
     if (status == TL_OK)
         status = do_lattice(j, error);
+    if (status == TL_OK && !j->options->shards && j->deepest > 0 && !j->list.levels[j->deepest].count) {
+        clear_work(j);
+        rmdir(j->folder);
+        return tl_fail(error, TL_ERROR_DATA, "%s: no height is known in it; --nodata, --band or --voids may help",
+                       j->source->info.name);
+    }
     while (status == TL_OK && !j->options->shards && j->level > ROOT_LATTICE &&
            j->level - 2 > j->options->first_level) {
         status = go_up(j, error);

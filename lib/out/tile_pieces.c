@@ -171,11 +171,16 @@ static bool read_file(FILE *file, out_piece *piece, bool samples)
     if (fread(&h, sizeof h, 1, file) != 1 || h.magic != MAGIC || h.tile_count > MOST_TILES)
         return false;
     piece->tile_count = h.tile_count;
-    piece->resampling = h.resampling;
     piece->tiles = tl_alloc(h.tile_count + 1, sizeof *piece->tiles);
     if (!piece->tiles || fread(piece->tiles, sizeof *piece->tiles, h.tile_count, file) != h.tile_count)
         return false;
-    return read_values(file, &h, piece, samples);
+    for (uint64_t k = 0; k < h.tile_count; k++)
+        if (piece->tiles[k].level < 0 || piece->tiles[k].level >= TL_TILE_LEVELS || piece->tiles[k].bytes < 0)
+            return false;
+    if (!read_values(file, &h, piece, samples))
+        return false;
+    piece->resampling = h.resampling;
+    return true;
 }
 
 tl_status out_piece_load(out_piece *piece, const char *folder, bool samples, bool *found, tl_error *error)

@@ -485,7 +485,7 @@ tl_status scene_geodetic_compare(const scene_geodetic *g, int64_t x, int64_t y, 
 {
     comparison c = {g, x, y, cells, z, stride, 0};
     const tl_source_info *info = &g->source->info;
-    int64_t step = g->projection ? 4 : 1;
+    const int64_t step = 1;
     tl_window w;
     *worst = 0;
     if (!find_samples(&c, &w))

@@ -45,7 +45,7 @@ tl_status scene_geodetic_read(const scene_geodetic *lattice, tl_window window, f
 
 /* The largest difference, in metres, between the surface over heights of the lattice (the smallest triangles of the
  * framework's rule, dem/framework.h) and the source's samples under the `cells` cells from vertex (x, y) on; z: the
- * height of that vertex, in rows of `stride`. On maps one sample in sixteen is looked at, for their places take time.
+ * height of that vertex, in rows of `stride`.
  */
 tl_status scene_geodetic_compare(const scene_geodetic *lattice, int64_t x, int64_t y, int cells, const float *z,
                                  int64_t stride, double *worst, tl_error *error);

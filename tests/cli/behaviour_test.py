@@ -643,6 +643,17 @@ def sidecars_are_checked(case):
                 file.write(good)
 
 
+def tiles_of_nothing_are_refused(case):
+    """A DEM without a height makes no tiles; a dry run foresees all that there will be at most."""
+    write_tiff(case.path("void.tif"), 60, 50, [math.nan] * 3000, point=False, **UTM)
+    said = case.run("tiles", "void.tif", "-o", "none", status=1).err
+    expect("no height is known" in said and not os.path.exists(case.path("none")), said)
+    foreseen = case.run("tiles", EXAMPLE, "-l", "0..9", "--dry-run", "-o", "none").err
+    made = case.run("tiles", EXAMPLE, "-l", "0..9", "-o", "some").err
+    most, tiles = (int(re.search(pattern, text).group(1)) for pattern, text in ((r"at most (\d+) tiles", foreseen), (r"some: (\d+) tiles", made)))
+    expect(tiles <= most <= tiles + 4, f"{foreseen} {made}")
+
+
 def outputs_are_made_again(case):
     """--same-as gives the same bytes in every format, with files of its options and names with spaces; other options go over it."""
     write_dem(case, "a dem.tif", width=100, height=90)
@@ -661,6 +672,16 @@ def outputs_are_made_again(case):
     case.run("synth", "--same-as", "c.exr", "--seed", 0, "-q", "-o", "d.exr")
     with open(case.path("a.exr"), "rb") as one, open(case.path("d.exr"), "rb") as other:
         expect(one.read() == other.read(), "the default over the record")
+    itself = case.run("synth", "--same-as", "a.exr", "-o", "a.exr", "--overwrite", status=2).err
+    expect("name another output" in itself, itself)
+    with open(case.path("a.raw.json"), encoding="utf-8") as file:
+        about = json.load(file)
+    for wrong in ("-o c.tif --overwrite", "--overwrite", "--output=c.tif", "--same-as a.exr", "-q"):
+        about["parameters"]["command"] = f'synth {wrong} --levels 1 "a dem.tif"'
+        with open(case.path("a.raw.json"), "w", encoding="utf-8") as file:
+            json.dump(about, file)
+        refused = case.run("synth", "--same-as", "a.raw", "-o", "g.exr", status=2).err
+        expect("does not record" in refused, refused)
     write_dem(case, "a dem.tif", width=101, height=90)
     refused = case.run("synth", "--same-as", "a.exr", "-q", "-o", "e.exr", status=1).err
     expect("not kept" in refused, refused)
@@ -1273,7 +1294,7 @@ TESTS = [
     bar_only_on_a_terminal, progress_lines_are_json, quiet_is_silent,
     json_keeps_its_schema, statistics_keep_their_schema, real_files_keep_the_schema, window_costs_its_blocks, a_part_is_that_part, corners_agree_with_gdal,
     names_of_any_bytes,
-    serves_the_folder_alone, formats_hold_the_same_heights, outputs_are_read_back, sidecars_are_checked, outputs_are_made_again, png_within_half_a_step, point_samples_are_kept, point_samples_of_the_andes_are_kept,
+    serves_the_folder_alone, tiles_of_nothing_are_refused, formats_hold_the_same_heights, outputs_are_read_back, sidecars_are_checked, outputs_are_made_again, png_within_half_a_step, point_samples_are_kept, point_samples_of_the_andes_are_kept,
     area_means_stay_on_their_footprint,
     glb_is_in_metres, frames_agree, simplify_keeps_its_word, diagonals_are_turned, codings_keep_the_bound, layers_are_written_beside, inputs_are_not_overwritten, layers_are_refused_before_the_work, vertices_tell_where_they_came_from,
     flights_tell_how_far_ground_jumps, pictures_take_colours_of_rasters,
