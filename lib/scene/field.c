@@ -590,38 +590,34 @@ void scene_field_fractal(const tl_source *source, int level, double *delta, doub
     *hurst = f->hursts[level];
 }
 
-tl_status scene_field_strengths(const tl_source *source, tl_window window, float *out, tl_error *error)
+/* One of the planes at the model's samples; `otherwise` everywhere where the chain has none. */
+static tl_status read_plane(const field *f, int plane, bool is_there, float otherwise, tl_window window, float *out,
+                            tl_error *error)
 {
-    const field *f = as_field(source);
     size_t count = (size_t)(window.width * window.height);
     for (size_t k = 0; k < count; k++)
-        out[k] = 1;
-    if (!f->chain.mapped)
+        out[k] = otherwise;
+    if (!is_there)
         return TL_OK;
     ground g;
     fbm_window from = {window.x, window.y, (size_t)window.width, (size_t)window.height, (size_t)window.width};
     tl_status status = ground_read(f, from, &g, error);
     if (status == TL_OK)
-        memcpy(out, g.planes.of[SCENE_STRENGTH], count * sizeof *out);
+        memcpy(out, g.planes.of[plane], count * sizeof *out);
     ground_free(&g);
     return status;
+}
+
+tl_status scene_field_strengths(const tl_source *source, tl_window window, float *out, tl_error *error)
+{
+    const field *f = as_field(source);
+    return read_plane(f, SCENE_STRENGTH, f->chain.mapped, 1, window, out, error);
 }
 
 tl_status scene_field_hursts(const tl_source *source, tl_window window, float *out, tl_error *error)
 {
     const field *f = as_field(source);
-    size_t count = (size_t)(window.width * window.height);
-    for (size_t k = 0; k < count; k++)
-        out[k] = (float)f->hursts[f->source.info.level];
-    if (!f->chain.placed)
-        return TL_OK;
-    ground g;
-    fbm_window from = {window.x, window.y, (size_t)window.width, (size_t)window.height, (size_t)window.width};
-    tl_status status = ground_read(f, from, &g, error);
-    if (status == TL_OK)
-        memcpy(out, g.planes.of[SCENE_HURST], count * sizeof *out);
-    ground_free(&g);
-    return status;
+    return read_plane(f, SCENE_HURST, f->chain.placed, (float)f->hursts[f->source.info.level], window, out, error);
 }
 
 tl_window scene_field_support(const tl_source *source, int level, tl_window window)

@@ -422,15 +422,14 @@ static double surface(const comparison *c, double u, double v)
     return fu >= fv ? sw + fu * (se - sw) + fv * (ne - se) : sw + fv * (nw - sw) + fu * (ne - nw);
 }
 
-/* A row of samples, of whose every `step`-th the place is known, in degrees. */
-static void compare_row(comparison *c, const float *row, const double *longitude, const double *latitude, int64_t count,
-                        int64_t step)
+/* A row of samples, whose places are in degrees. */
+static void compare_row(comparison *c, const float *row, const double *longitude, const double *latitude, int64_t count)
 {
     const scene_geodetic *g = c->g;
     double unit = g->source->info.georef.height_unit, per_degree = 1 / scene_geodetic_step(g->level);
     double around = (double)scene_geodetic_columns(g->level), middle = (double)c->x + 0.5 * c->cells;
-    for (int64_t k = 0; k < count; k += step) {
-        double u = (longitude[k / step] + g->meridian + 180) * per_degree, v = (latitude[k / step] + 90) * per_degree;
+    for (int64_t k = 0; k < count; k++) {
+        double u = (longitude[k] + g->meridian + 180) * per_degree, v = (latitude[k] + 90) * per_degree;
         u -= around * rint((u - middle) / around);
         u -= (double)c->x, v -= (double)c->y;
         if (!(u >= 0 && v >= 0 && u <= c->cells && v <= c->cells) || !isfinite(row[k]))
@@ -465,19 +464,18 @@ static bool find_samples(const comparison *c, tl_window *out)
     return find_part(&g->source->info, at, SIDE * SIDE, out);
 }
 
-/* Places of every `step`-th sample of a row, in degrees. */
-static tl_status find_degrees(const scene_geodetic *g, tl_window w, int64_t step, double *longitude, double *latitude,
+/* Places of a row's samples, in degrees. */
+static tl_status find_degrees(const scene_geodetic *g, tl_window w, double *longitude, double *latitude,
                               tl_error *error)
 {
     const tl_georef *georef = &g->source->info.georef;
     const double *t = georef->transform;
-    size_t count = 0;
-    for (int64_t k = 0; k < w.width; k += step, count++) {
+    for (int64_t k = 0; k < w.width; k++) {
         double i = (double)(w.x + k), j = (double)w.y;
-        longitude[count] = g->projection ? i : t[0] + t[1] * i + t[2] * j;
-        latitude[count] = g->projection ? j : t[3] + t[4] * i + t[5] * j;
+        longitude[k] = g->projection ? i : t[0] + t[1] * i + t[2] * j;
+        latitude[k] = g->projection ? j : t[3] + t[4] * i + t[5] * j;
     }
-    return g->projection ? tl_georef_to_lonlat(georef, count, longitude, latitude, error) : TL_OK;
+    return g->projection ? tl_georef_to_lonlat(georef, (size_t)w.width, longitude, latitude, error) : TL_OK;
 }
 
 tl_status scene_geodetic_compare(const scene_geodetic *g, int64_t x, int64_t y, int cells, const float *z,
@@ -485,7 +483,6 @@ tl_status scene_geodetic_compare(const scene_geodetic *g, int64_t x, int64_t y, 
 {
     comparison c = {g, x, y, cells, z, stride, 0};
     const tl_source_info *info = &g->source->info;
-    const int64_t step = 1;
     tl_window w;
     *worst = 0;
     if (!find_samples(&c, &w))
@@ -495,13 +492,13 @@ tl_status scene_geodetic_compare(const scene_geodetic *g, int64_t x, int64_t y, 
     double *latitude = tl_alloc((size_t)w.width, sizeof *latitude);
     part row = {.z = tl_alloc((size_t)w.width, sizeof *row.z)};
     tl_status status = longitude && latitude && row.z ? TL_OK : tl_fail_memory(error, info->name);
-    for (int64_t line = 0; line < w.height && status == TL_OK; line += step) {
+    for (int64_t line = 0; line < w.height && status == TL_OK; line++) {
         row.window = (tl_window){w.x, w.y + line, w.width, 1};
         status = read_part(g->source, &row, error);
         if (status == TL_OK)
-            status = find_degrees(g, row.window, step, longitude, latitude, error);
+            status = find_degrees(g, row.window, longitude, latitude, error);
         if (status == TL_OK)
-            compare_row(&c, row.z, longitude, latitude, w.width, step);
+            compare_row(&c, row.z, longitude, latitude, w.width);
     }
     *worst = c.worst;
     free(row.z);
