@@ -643,15 +643,7 @@ static int run_synth(const command *self, int argc, const char **argv, bool help
     const option detail[] = {
         {"levels", 'l', OPTION_INTEGER, &set.levels, NULL, "N",
          "halvings of the DEM's spacing, 0...30 (default: 4, 16 times finer)", 0, 30, NULL},
-        {"seed", 's', OPTION_INTEGER, &set.seed, NULL, "N", "another seed, another terrain, 0...2^62 (default: 0)", 0,
-         0x1p62, NULL},
-        {"hurst", 0, OPTION_NUMBER, &set.field.hurst, &set.field.hurst_given, "H",
-         "Hurst exponent of the detail, 0.01...0.99 (default: measured from the DEM, octave by octave)", 0.01, 0.99,
-         NULL},
-        {"delta", 0, OPTION_NUMBER, &set.field.delta, &set.field.delta_given, "D",
-         "standard deviation of the height difference over one DEM sample, in the DEM's unit, 0...1e30 (default: "
-         "measured)",
-         0, 1e30, NULL},
+        FRACTAL_OPTIONS(set.seed, set.field),
         {"hurst-map", 0, OPTION_TEXT, &set.hurst_map, NULL, "RASTER[:BAND]",
          "--hurst from place to place, as the first band of stats --maps", 0, 0, NULL},
         {"delta-map", 0, OPTION_TEXT, &set.delta_map, NULL, "RASTER[:BAND]", "--delta from place to place", 0, 0, NULL},
@@ -663,8 +655,6 @@ static int run_synth(const command *self, int argc, const char **argv, bool help
          1e30, NULL},
         {"verify", 0, OPTION_FLAG, &set.verify, NULL, NULL, "with --max-error: measure the result against the DEM", 0,
          0, NULL},
-        {"scheme", 0, OPTION_TEXT, &set.field.scheme, NULL, "NAME",
-         "way to refine, listed below (default: terrain; stationary with --hurst, --delta or a map)", 0, 0, NULL},
         {"support", 0, OPTION_CHOICE, &set.support, NULL, "KIND",
          "what samples stand for: as the raster says, means over cells, or points (default: raster)", 0, 0, supports},
         {0}};

@@ -175,17 +175,10 @@ static int run_tiles(const command *self, int argc, const char **argv, bool help
         {"attribution", 0, OPTION_TEXT, &set.attribution, NULL, "TEXT", "to be shown with the terrain", 0, 0, NULL},
         {"dry-run", 'n', OPTION_FLAG, &set.dry_run, NULL, NULL, "only tell how many tiles there will be", 0, 0, NULL},
         {0}};
-    const option detail[] = {
-        {"extra-levels", 'x', OPTION_INTEGER, &set.extra, NULL, "N",
-         "levels finer than the DEM, with fractal detail, 0...10 (default: 0)", 0, 10, NULL},
-        {"seed", 's', OPTION_INTEGER, &set.seed, NULL, "N", "another seed, another terrain, 0...2^62 (default: 0)", 0,
-         0x1p62, NULL},
-        {"hurst", 0, OPTION_NUMBER, &set.field.hurst, &set.field.hurst_given, "H",
-         "Hurst exponent of the detail, 0.01...0.99 (default: measured from the DEM, octave by octave)", 0.01, 0.99,
-         NULL},
-        {"delta", 0, OPTION_NUMBER, &set.field.delta, &set.field.delta_given, "D",
-         "standard deviation of the height difference over one DEM sample (default: measured)", 0, 1e30, NULL},
-        {0}};
+    const option detail[] = {{"extra-levels", 'x', OPTION_INTEGER, &set.extra, NULL, "N",
+                              "levels finer than the DEM, with fractal detail, 0...10 (default: 0)", 0, 10, NULL},
+                             FRACTAL_OPTIONS(set.seed, set.field),
+                             {0}};
     const option parts[] = {
         {"resume", 0, OPTION_FLAG, &set.resume, NULL, NULL, "go on with a folder where an earlier run was interrupted",
          0, 0, NULL},

@@ -135,6 +135,38 @@ typedef struct common {
             "of a .glb: files NAME_x0_y0.glb and so on, of at most N triangles, 1000...2^31 (default: one)", 1000, \
             2147483648, NULL                                                                                       \
     }
+/* How detail is made, in all commands that make it: rows of an int64_t and a tl_field_options. */
+#define FRACTAL_OPTIONS(number, f)                                                                                 \
+    {"seed", 's', OPTION_INTEGER, &(number), NULL, "N", "another seed, another terrain, 0...2^62 (default: 0)", 0, \
+     0x1p62, NULL},                                                                                                \
+        {"hurst",                                                                                                  \
+         0,                                                                                                        \
+         OPTION_NUMBER,                                                                                            \
+         &(f).hurst,                                                                                               \
+         &(f).hurst_given,                                                                                         \
+         "H",                                                                                                      \
+         "Hurst exponent of the detail, 0.01...0.99 (default: measured from the DEM, octave by octave)",           \
+         0.01,                                                                                                     \
+         0.99,                                                                                                     \
+         NULL},                                                                                                    \
+        {"delta",                                                                                                  \
+         0,                                                                                                        \
+         OPTION_NUMBER,                                                                                            \
+         &(f).delta,                                                                                               \
+         &(f).delta_given,                                                                                         \
+         "D",                                                                                                      \
+         "standard deviation of the height difference over one DEM sample, in the DEM's unit, 0...1e30 (default: " \
+         "measured)",                                                                                              \
+         0,                                                                                                        \
+         1e30,                                                                                                     \
+         NULL},                                                                                                    \
+    {                                                                                                              \
+        "scheme", 0, OPTION_TEXT, &(f).scheme, NULL, "NAME",                                                       \
+            "way to refine, of those that 'talus help synth' lists (default: terrain; stationary with --hurst, "   \
+            "--delta or a map)",                                                                                   \
+            0, 0, NULL                                                                                             \
+    }
+
 #define COMMON_RUNNING(c)                                                                                              \
     {"threads", 't', OPTION_INTEGER, &(c).threads, NULL, "N", "worker threads, 1...512 (default: one a processor)", 1, \
      512,       NULL},                                                                                                 \

@@ -19,52 +19,21 @@ typedef struct lod_options {
 extern const char *const selector_names[]; /* by tl_selector, ended by NULL */
 
 /* The rows of the options in a `lod_options`, for use inside of an array of options. */
-#define DETAIL_OPTIONS(v)                                                                                              \
-    {"levels",                                                                                                         \
-     'l',                                                                                                              \
-     OPTION_INTEGER,                                                                                                   \
-     &(v).levels,                                                                                                      \
-     NULL,                                                                                                             \
-     "N",                                                                                                              \
-     "halvings of the DEM's spacing that there may be, 0...30 (default: 6, 64 times finer)",                           \
-     0,                                                                                                                \
-     30,                                                                                                               \
-     NULL},                                                                                                            \
-        {"seed", 's', OPTION_INTEGER, &(v).seed, NULL, "N", "another seed, another terrain, 0...2^62 (default: 0)", 0, \
-         0x1p62, NULL},                                                                                                \
-        {"hurst",                                                                                                      \
-         0,                                                                                                            \
-         OPTION_NUMBER,                                                                                                \
-         &(v).field.hurst,                                                                                             \
-         &(v).field.hurst_given,                                                                                       \
-         "H",                                                                                                          \
-         "Hurst exponent of the detail, 0.01...0.99 (default: measured from the DEM)",                                 \
-         0.01,                                                                                                         \
-         0.99,                                                                                                         \
-         NULL},                                                                                                        \
-        {"delta",                                                                                                      \
-         0,                                                                                                            \
-         OPTION_NUMBER,                                                                                                \
-         &(v).field.delta,                                                                                             \
-         &(v).field.delta_given,                                                                                       \
-         "D",                                                                                                          \
-         "standard deviation of the height difference over one DEM sample, 0...1e30 (default: measured)",              \
-         0,                                                                                                            \
-         1e30,                                                                                                         \
-         NULL},                                                                                                        \
-        {"scheme",                                                                                                     \
-         0,                                                                                                            \
-         OPTION_TEXT,                                                                                                  \
-         &(v).field.scheme,                                                                                            \
-         NULL,                                                                                                         \
-         "NAME",                                                                                                       \
-         "way to refine, as in synth (default: terrain; stationary with --hurst or --delta)",                          \
-         0,                                                                                                            \
-         0,                                                                                                            \
-         NULL},                                                                                                        \
-    {                                                                                                                  \
-        "error-cache", 0, OPTION_TEXT, &(v).error_cache, NULL, "FILE",                                                 \
-            "a GeoTIFF that keeps the DEM's errors: used again while it stays the same", 0, 0, NULL                    \
+#define DETAIL_OPTIONS(v)                                                                           \
+    {"levels",                                                                                      \
+     'l',                                                                                           \
+     OPTION_INTEGER,                                                                                \
+     &(v).levels,                                                                                   \
+     NULL,                                                                                          \
+     "N",                                                                                           \
+     "halvings of the DEM's spacing that there may be, 0...30 (default: 6, 64 times finer)",        \
+     0,                                                                                             \
+     30,                                                                                            \
+     NULL},                                                                                         \
+        FRACTAL_OPTIONS((v).seed, (v).field),                                                       \
+    {                                                                                               \
+        "error-cache", 0, OPTION_TEXT, &(v).error_cache, NULL, "FILE",                              \
+            "a GeoTIFF that keeps the DEM's errors: used again while it stays the same", 0, 0, NULL \
     }
 
 #define LOD_OPTIONS(v)                                                                                                  \
