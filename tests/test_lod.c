@@ -431,6 +431,29 @@ static void budgetsBelowTheCoarsestAreRefused(void **state)
     free_world(&w);
 }
 
+/* The search ends where no smaller error adds anything: some octaves of errors below its start, not all that there are.
+ */
+static void budgetsBeyondAllDetailTakeIt(void **state)
+{
+    (void)state;
+    tl_error error;
+    world w = make_world(40, 40, 1, VOIDS_MANY, 10, 3);
+    tl_view view = view_over(&w, 0, -60, 400);
+    for (int selector = 0; selector < 3; selector++) {
+        tl_lod_options all = {.selector = (tl_selector)selector, .pixel_error = 1e-9, .keep = 15};
+        tl_lod_options much = {.selector = (tl_selector)selector, .budget = UINT64_C(1) << 31, .keep = 15};
+        tl_lod_stats of_all, of_much;
+        tl_mesh *mesh = NULL;
+        assert_int_equal(tl_select(w.field, w.dem, w.pyramid, &view, &all, &mesh, &of_all, &error), TL_OK);
+        tl_mesh_destroy(mesh);
+        assert_int_equal(tl_select(w.field, w.dem, w.pyramid, &view, &much, &mesh, &of_much, &error), TL_OK);
+        tl_mesh_destroy(mesh);
+        assert_int_equal(of_much.triangles, of_all.triangles);
+        assert_true(of_much.visited <= 12 * of_all.visited);
+    }
+    free_world(&w);
+}
+
 /* ---- Culling ---- */
 
 static bool has_triangle(const corners *all, size_t count, const corners *one)
@@ -936,6 +959,7 @@ int main(void)
         cmocka_unit_test(flightsKeepBudgets),
         cmocka_unit_test(budgetsAreKept),
         cmocka_unit_test(budgetsBelowTheCoarsestAreRefused),
+        cmocka_unit_test(budgetsBeyondAllDetailTakeIt),
         cmocka_unit_test(cullingChangesNothingSeen),
         cmocka_unit_test(culledGroundIsNotMadeNorRead),
         cmocka_unit_test(finerPixelErrorsContainCoarserOnes),

@@ -200,9 +200,19 @@ static double error_at(int k, double least)
     return fmax(exp2((double)k / STEPS), least);
 }
 
+/* The next smaller error to try: at least `step` down, and as far down as nothing changes; first - 1: none does. */
+static int go_down(const lod *l, int k, int step, int first)
+{
+    if (l->next <= error_at(first - 1, 0))
+        return first - 1;
+    int changes = (int)floor(STEPS * log2(l->next));
+    k = changes < k - step ? changes : k - step;
+    return k > first ? k : first;
+}
+
 /* Goes from `at` upwards until it fits, or downwards until it does not, by larger and larger steps. */
-static tl_status bracket(double least, int first, int step, int *good, int *bad, int *last, lod_try *try, void *context,
-                         tl_error *error)
+static tl_status bracket(const lod *l, double least, int first, int step, int *good, int *bad, int *last, lod_try *try,
+                         void *context, tl_error *error)
 {
     bool fits;
     int k = *last;
@@ -214,7 +224,11 @@ static tl_status bracket(double least, int first, int step, int *good, int *bad,
         *last = k;
         if (fits == up || (fits && k == first) || (!fits && k == LARGEST))
             break;
-        k = up ? (k + step < LARGEST ? k + step : LARGEST) : (k - step > first ? k - step : first);
+        k = up ? (k + step < LARGEST ? k + step : LARGEST) : go_down(l, k, step, first);
+        if (k < first) {
+            *bad = *good - 1; /* nothing to gain */
+            break;
+        }
         step = 2 * step < STEPS ? 2 * step : STEPS;
         status = try(context, error_at(k, least), &fits, error);
     }
@@ -225,7 +239,7 @@ tl_status lod_search_budget(const lod *l, double least, int step, int *at, lod_t
 {
     int first = least > 0 ? (int)floor(STEPS * log2(fmin(fmax(least, exp2(-30)), exp2(39)))) : LEAST, good, bad;
     int last = *at < first ? first : *at;
-    tl_status status = bracket(least, first, step, &good, &bad, &last, try, context, error);
+    tl_status status = bracket(l, least, first, step, &good, &bad, &last, try, context, error);
     while (status == TL_OK && good <= LARGEST && good - bad > 1) {
         bool fits;
         last = bad + (good - bad) / 2;

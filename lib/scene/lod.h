@@ -87,6 +87,7 @@ typedef struct lod {
     double steepest;    /* slopes that the field adds to those between samples: a bound, where the strength is 1 */
     float filling;      /* height that voids are taken to have, for their places */
     double pixel_error; /* allowed */
+    double next;        /* the greatest error at or below it at which something more would be split; 0: at none */
     const scene_view *view;
     const scene_camera *camera;
     double near;         /* pixels by `pixel_error`: errors are too large nearer than this times themselves */
@@ -136,8 +137,14 @@ bool lod_behind_ridge(const lod *l, const lod_triangle *t, int depth);
  * for triangles of a depth. Units of height. */
 double lod_residual(const lod *l, const scene_cells *cells);
 double lod_residual_at(const lod *l, const scene_cells *cells, int depth);
-/* Whether triangles of a depth with this error (metres) at this distance are to be split. */
-bool lod_wants(const lod *l, int depth, double error, double distance);
+/* Whether triangles of a depth with this error (metres) at this distance are to be split; takes note where not. */
+bool lod_wants(lod *l, int depth, double error, double distance);
+/* Takes note of what is not split because fewer pixels than these are not asked for. */
+static inline void lod_spare(lod *l, float priority)
+{
+    if ((double)priority <= l->pixel_error && (double)priority > l->next)
+        l->next = (double)priority;
+}
 /* To be called when the allowed pixel error changes. */
 void lod_allow(lod *l, double pixel_error);
 /* The depth from which on triangles lie in one block of scene_tiles. */
@@ -217,7 +224,7 @@ tl_status lod_morph(lod *l, float **out, double *pixels, tl_error *error);
 /* ---- Budgets ---- */
 
 /* Tries pixel errors of a fixed sequence, 2^(k / 64) and the one that was asked for, for a small one that stays within
- * the budget, where the next smaller one does not. `try` sets *fits; the last try is the result. */
+ * the budget, where the next smaller one does not or none gives more. `try` sets *fits; the last try is the result. */
 typedef tl_status lod_try(void *context, double pixel_error, bool *fits, tl_error *error);
 tl_status lod_search_budget(const lod *l, double least, int step, int *at, lod_try *try, void *context,
                             tl_error *error);

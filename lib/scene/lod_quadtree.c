@@ -215,6 +215,7 @@ static tl_status sort_out(search *self, tl_error *error)
             triangles[kept++].step = v->step;
         } else if (v->state != LOD_DROPPED) {
             l->stats.pixel_error = fmax(l->stats.pixel_error, self->seen ? 0 : (double)v->pixels);
+            lod_spare(l, v->priority);
             status = leave(self, &triangles[k], v->state != LOD_SPLIT || v->pixels < HUGE_VALF, error);
         }
     }

@@ -709,6 +709,11 @@ static tl_status try_error(void *context, double pixel_error, bool *fits, tl_err
         status = split_all(r, &r->stale, error);
     if (status == TL_OK)
         status = count_triangles(r, &triangles, error);
+    for (size_t k = 0; k < r->nodes.count; k++) {
+        const node *n = node_at(r, (uint32_t)k);
+        if (n->live && n->children == LOD_NONE && n->state >= LOD_LEAF && !n->stuck)
+            lod_spare(&r->l, n->priority);
+    }
     *fits = triangles <= r->options.budget;
     return status;
 }

@@ -419,15 +419,18 @@ static float priority_of(const lod *l, int depth, double error, double distance)
     return (float)scene_view_pixels(l->view, error, distance);
 }
 
-bool lod_wants(const lod *l, int depth, double error, double distance)
+bool lod_wants(lod *l, int depth, double error, double distance)
 {
-    return (double)priority_of(l, depth, error, distance) > l->pixel_error;
+    float priority = priority_of(l, depth, error, distance);
+    lod_spare(l, priority);
+    return (double)priority > l->pixel_error;
 }
 
 void lod_allow(lod *l, double pixel_error)
 {
     double small = 0, large = 1; /* of x = error / (2 distance): see scene_view_pixels */
     l->pixel_error = pixel_error;
+    l->next = 0;
     for (int k = 0; k < 60; k++) {
         double middle = .5 * (small + large);
         *(scene_view_pixels(l->view, 2 * middle, 1) > pixel_error ? &large : &small) = middle;
