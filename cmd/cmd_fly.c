@@ -148,8 +148,10 @@ static tl_status draw_frame(const journey *j, const tl_mesh *mesh, size_t frame,
 static tl_status write_frame(const journey *j, const tl_mesh *mesh, size_t frame, tl_error *error)
 {
     char name[NAME];
-    const tl_write_options writing = {
-        .overwrite = j->set->common.overwrite, .frame = (tl_frame)j->set->frame, .run = j->run};
+    const tl_write_options writing = {.overwrite = j->set->common.overwrite,
+                                      .frame = (tl_frame)j->set->frame,
+                                      .ground = j->ground->field,
+                                      .run = j->run};
     if (frame_name(j->set->common.output, frame, name))
         return draws_pictures(j->set) ? draw_frame(j, mesh, frame, name, error)
                                       : tl_write_mesh(mesh, name, &writing, error);

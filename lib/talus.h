@@ -1040,10 +1040,14 @@ typedef struct tl_write_options {
     /* GLB, of meshes that tl_mesh_parent_heights knows: also write these, as the attribute _PARENT_HEIGHT, and the ways
      * there as a morph target, "parent". */
     bool parent_heights;
-    /* GLB: textures of this source, over whose finest lattice the mesh lies: tl_texture values, added. Texels are
-     * samples of its finest level that has at most texture_size (0: 4096) a side, a PNG each. With TL_TEXTURE_NORMAL
-     * the vertices' own normals point up and tangents along rows: the texture holds the slopes, in metres. */
+    /* GLB: the source over whose finest lattice the mesh lies. Vertices have its normals, turned into the frame: of
+     * samples of its finest level or, of a field of point samples, of the level whose spacing is the vertex's shortest
+     * edge; by central differences, one-sided at the rim and beside voids. NULL: normals are those of the mesh's own
+     * triangles, weighted by their areas. */
     const tl_source *ground;
+    /* GLB: textures of `ground`: tl_texture values, added. Texels are samples of its finest level that has at most
+     * texture_size (0: 4096) a side, a PNG each. With TL_TEXTURE_NORMAL the vertices' own normals point up and tangents
+     * along rows: the texture holds the slopes, in metres. */
     unsigned textures;
     int texture_size;
     /* GLB, above 0: files NAME_x0_y0.glb and so on, tiles of the mesh from its first column and row, of at most so many

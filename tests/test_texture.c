@@ -363,19 +363,18 @@ static size_t gather(const bench *b, const glb *g, double (*known)[6])
 }
 
 /* Parts have the vertices of the whole, to the bit, and on their common rims all of them. */
-static void partsJoin(void **state)
+static void check_parts(const bench *b, unsigned textures)
 {
-    bench *b = *state;
     enum { SPLIT = 500 };
     double(*known)[6] = malloc(sizeof *known * WIDTH * HEIGHT);
     for (int k = 0; k < WIDTH * HEIGHT; k++)
         known[k][0] = (double)NAN;
-    glb g = write_glb(b, (tl_write_options){0});
+    glb g = write_glb(b, (tl_write_options){.textures = textures});
     assert_int_equal(gather(b, &g, known), 0);
     close_glb(&g);
     unlink(b->path);
     tl_error error;
-    const tl_write_options options = {.split = SPLIT};
+    const tl_write_options options = {.split = SPLIT, .ground = b->source, .textures = textures};
     assert_int_equal(tl_write_mesh(b->mesh, b->path, &options, &error), TL_OK);
     assert_int_not_equal(access(b->path, F_OK), 0);
     size_t triangles = 0, vertices = 0, files = 0;
@@ -404,6 +403,277 @@ static void partsJoin(void **state)
     free(known);
 }
 
+static void partsJoin(void **state)
+{
+    check_parts(*state, 0);
+    check_parts(*state, TL_TEXTURE_NORMAL);
+}
+
+/* ---- Normals of the ground ---- */
+
+/* The normal of vertex k, as a reader has it: by the node's scale, or turned by its matrix. */
+static void normal_of(const glb *g, size_t k, double out[3])
+{
+    json_t *matrix = json_object_get(item(g->json, "nodes", 0), "matrix");
+    double stored[3], length = 0;
+    attribute(g, "NORMAL", k, 3, stored);
+    for (size_t a = 0; a < 3; a++) {
+        out[a] = matrix ? 0 : stored[a] / of_node(g, "scale", a, 1);
+        for (size_t c = 0; matrix && c < 3; c++) {
+            double column = 0; /* a turn and a scale: the inverse divides by the scale's square */
+            for (size_t r = 0; r < 3; r++)
+                column += pow(json_number_value(json_array_get(matrix, 4 * c + r)), 2);
+            out[a] += json_number_value(json_array_get(matrix, 4 * c + a)) * stored[c] / column;
+        }
+        length += out[a] * out[a];
+    }
+    for (int a = 0; a < 3; a++)
+        out[a] /= sqrt(length);
+}
+
+/* Largest difference between a normal of 16-bit steps and the true one: each of its numbers, which are scaled by the
+ * node's steps, is off by half a step at most. */
+static double coarseness(const glb *g, const double n[3])
+{
+    double length = 0, off = 0;
+    for (size_t a = 0; a < 3; a++)
+        length += pow(n[a] * of_node(g, "scale", a, 1), 2);
+    for (size_t a = 0; a < 3; a++)
+        off += pow(0.5 / 32767 * sqrt(length) / of_node(g, "scale", a, 1), 2);
+    return 2 * sqrt(off); /* and it is made one long again */
+}
+
+/* Whole multiples of 1/64: exact in floats, and so are their central differences. */
+static double bowl(int i, int j)
+{
+    return 1000 + i * i / 64.0 - j * j / 32.0 + i * j / 64.0 + 2 * i - j;
+}
+
+static void fill(bench *b, double (*height)(int, int))
+{
+    for (int k = 0; k < WIDTH * HEIGHT; k++)
+        b->heights[k] = (float)height(k % WIDTH, k / WIDTH);
+}
+
+static void simplify(bench *b, double max_error)
+{
+    tl_mesh_destroy(b->mesh);
+    assert_int_equal(tl_simplify(b->source, &(tl_simplify_options){.max_error = max_error, .frame = TL_FRAME_PIXEL},
+                                 &b->mesh, NULL, NULL),
+                     TL_OK);
+}
+
+static void assert_normal(const double found[3], const double wanted[3], double tolerance)
+{
+    for (int a = 0; a < 3; a++)
+        assert_near(found[a], wanted[a], tolerance);
+}
+
+static bool on_rim(int i, int j)
+{
+    return i == 0 || j == 0 || i == WIDTH - 1 || j == HEIGHT - 1;
+}
+
+/* Of a tenth of the vertices, each has the normal of the paraboloid, whatever triangles are around it. */
+static void simplifiedMeshesHaveTheGroundsNormals(void **state)
+{
+    bench *b = *state;
+    double *t = b->source->info.georef.transform;
+    fill(b, bowl);
+    for (int south = 0; south < 2; south++) {
+        t[5] = south ? 30 : -30;
+        simplify(b, 10);
+        assert_true(b->mesh->vertex_count < WIDTH * HEIGHT / 10);
+        for (int coding = 0; coding < 2; coding++) {
+            glb g = write_glb(b, (tl_write_options){.coding = codings[coding], .frame = TL_FRAME_PROJECTED});
+            for (size_t k = 0; k < b->mesh->vertex_count; k++) {
+                int i, j;
+                double n[3];
+                sample_of(b, &g, k, &i, &j);
+                if (on_rim(i, j))
+                    continue;
+                double x = (i / 32.0 + j / 64.0 + 2) / t[1], y = (-j / 16.0 + i / 64.0 - 1) / t[5];
+                double one = sqrt(1 + x * x + y * y), wanted[3] = {-x / one, 1 / one, y / one};
+                normal_of(&g, k, n);
+                assert_normal(n, wanted, coding ? coarseness(&g, wanted) : 2e-7);
+            }
+            close_glb(&g);
+        }
+    }
+}
+
+static double plane(int i, int j)
+{
+    return (i % 9 == 4 && j % 7 < 3) || (i > 40 && j < 12) ? (double)NAN : 500 + 12 * i + 7 * j;
+}
+
+/* Beside voids and at the rim differences are one-sided, which is the same for a plane. */
+static void planesAreEvenBesideVoids(void **state)
+{
+    bench *b = *state;
+    fill(b, plane);
+    simplify(b, 0);
+    const tl_frame frames[] = {TL_FRAME_PIXEL, TL_FRAME_PROJECTED};
+    for (int f = 0; f < 2; f++) {
+        glb g = write_glb(b, (tl_write_options){.frame = frames[f]});
+        double x = f ? 12 / 30.0 : 12, y = f ? 7 / -30.0 : 7, one = sqrt(1 + x * x + y * y);
+        const double wanted[3] = {-x / one, 1 / one, y / one};
+        assert_true(count_of(&g, "NORMAL") > 100);
+        for (size_t k = 0; k < count_of(&g, "NORMAL"); k++) {
+            double n[3];
+            normal_of(&g, k, n);
+            assert_normal(n, wanted, 2e-7);
+        }
+        close_glb(&g);
+    }
+}
+
+/* The normal above the ellipsoid of WGS 84 of heights that change by x a radian of longitude and y a radian of
+ * latitude, geocentric: steps east and north are those of the radii of curvature. */
+static void geocentric_normal(double longitude, double latitude, double h, double x, double y, double out[3])
+{
+    const double a = 6378137, f = 1 / 298.257223563, e2 = f * (2 - f);
+    double sl = sin(longitude), cl = cos(longitude), sp = sin(latitude), cp = cos(latitude);
+    double w = 1 - e2 * sp * sp, east = x / ((a / sqrt(w) + h) * cp), north = y / (a * (1 - e2) / (w * sqrt(w)) + h);
+    double one = sqrt(1 + east * east + north * north);
+    out[0] = (cl * cp + sl * east + sp * cl * north) / one;
+    out[1] = (sl * cp - cl * east + sp * sl * north) / one;
+    out[2] = (sp - cp * north) / one;
+}
+
+/* Over a raster in longitude and latitude, by the ellipsoid's geometry: in the file of geocentric coordinates, and,
+ * turned by the same matrix, in that of the tangent plane. */
+static void normalsStandOnTheEllipsoid(void **state)
+{
+    bench *b = *state;
+    const double radian = 3.14159265358979323846 / 180, step = 1.0 / 1200;
+    tl_crs *crs = NULL;
+    assert_int_equal(dem_crs_from_text("EPSG:4326", "test", &crs, NULL), TL_OK);
+    fill(b, bowl);
+    b->source->info.georef =
+        (tl_georef){.crs = crs, .located = true, .transform = {7.5, step, 0, 46.4, 0, -step}, .height_unit = 1};
+    b->source->info.georef.cell_x = 64, b->source->info.georef.cell_y = 92.6;
+    simplify(b, 10);
+    glb flat = write_glb(b, (tl_write_options){.frame = TL_FRAME_ENU});
+    glb round = write_glb(b, (tl_write_options){.frame = TL_FRAME_ECEF});
+    assert_int_equal(count_of(&flat, "NORMAL"), count_of(&round, "NORMAL"));
+    int checked = 0;
+    for (size_t k = 0; k < count_of(&round, "NORMAL"); k++) {
+        double n[3], at[3], level[3], same[3], best = HUGE_VAL, wanted[3] = {0};
+        attribute(&round, "NORMAL", k, 3, level);
+        attribute(&flat, "NORMAL", k, 3, same);
+        assert_normal(level, same, 0);
+        attribute(&flat, "POSITION", k, 3, at);
+        normal_of(&round, k, n);
+        bool rim = false;
+        for (size_t v = 0; v < b->mesh->vertex_count; v++) { /* that whose height and place these are */
+            int i = b->mesh->vertices[v].i, j = b->mesh->vertices[v].j;
+            double east = (i - (WIDTH - 1) / 2.0) * 64.1, south = (j - (HEIGHT - 1) / 2.0) * 92.6;
+            double off = hypot(at[0] - east, at[2] - south);
+            if (off > best)
+                continue;
+            best = off;
+            rim = on_rim(i, j);
+            geocentric_normal((7.5 + i * step) * radian, (46.4 - j * step) * radian, bowl(i, j),
+                              (i / 32.0 + j / 64.0 + 2) / (step * radian),
+                              (-j / 16.0 + i / 64.0 - 1) / (-step * radian), wanted);
+        }
+        assert_true(best < 30);
+        const double turned[3] = {wanted[0], wanted[2], -wanted[1]};
+        if (!rim)
+            assert_normal(n, turned, 3e-7), checked++;
+    }
+    assert_true(checked > 50);
+    close_glb(&flat);
+    close_glb(&round);
+    b->source->info.georef.crs = NULL;
+    tl_mesh_destroy(b->mesh);
+    b->mesh = NULL;
+    tl_crs_release(crs);
+}
+
+/* Edges of 4, 2 and 1 samples of a field of two levels: slopes are those over 4, 2 and 1 samples to both sides. */
+static void fieldsHaveTheNormalsOfTheirLevels(void **state)
+{
+    bench *b = *state;
+    const tl_field_options options = {
+        .levels = 2, .seed = 3, .scheme = "stationary", .hurst = 0.5, .delta = 9, .support = TL_SUPPORT_POINT};
+    tl_source *field = tl_field_create(b->source, &options, NULL);
+    assert_non_null(field);
+    enum { X = 100, Y = 80 };
+    tl_mesh mesh = {.vertex_count = 3, .triangle_count = 1, .georef = field->info.georef};
+    tl_vertex vertices[3];
+    uint32_t corners[3] = {0, 2, 1};
+    mesh.vertices = vertices;
+    mesh.indices = corners;
+    for (int step = 1; step <= 4; step *= 2) {
+        const tl_window around = {X - step, Y - step, 2 * step + 1, 2 * step + 1};
+        float heights[81];
+        assert_int_equal(tl_source_read(field, 2, around, heights, NULL), TL_OK);
+        int side = 2 * step + 1, middle = step * side + step;
+        for (int v = 0; v < 3; v++)
+            vertices[v] = (tl_vertex){X + (v == 1) * step, Y + (v == 2) * step, heights[middle]};
+        tl_error error;
+        if (tl_write_mesh(&mesh, b->path, &(tl_write_options){.overwrite = true, .ground = field}, &error) != TL_OK)
+            fail_msg("%s", error.text);
+        glb g = read_glb(b->path);
+        double x = (double)(heights[middle + step] - heights[middle - step]) / (2 * step * 7.5);
+        double y = (double)(heights[middle + step * side] - heights[middle - step * side]) / (2 * step * -7.5);
+        double one = sqrt(1 + x * x + y * y), n[3], at[3], last = HUGE_VAL;
+        const double wanted[3] = {-x / one, 1 / one, y / one};
+        size_t first = 0;
+        for (size_t k = 0; k < 3; k++) { /* the vertex at X, Y is the most western and the most northern */
+            attribute(&g, "POSITION", k, 3, at);
+            if (at[0] + at[2] < last)
+                last = at[0] + at[2], first = k;
+        }
+        normal_of(&g, first, n);
+        assert_normal(n, wanted, 1e-6);
+        close_glb(&g);
+    }
+    tl_source_destroy(field);
+}
+
+/* A floor looks down; a skirt is lit as the rim that it hangs from. */
+static void whatHangsBelowIsNoGround(void **state)
+{
+    bench *b = *state;
+    for (int k = 0; k < WIDTH * HEIGHT; k++)
+        b->heights[k] = (float)(300 + 12 * (k % WIDTH));
+    for (int base = 0; base < 2; base++) {
+        simplify(b, 1);
+        assert_int_equal(base ? tl_mesh_add_base(b->mesh, 50, NULL) : tl_mesh_add_skirt(b->mesh, 50, NULL), TL_OK);
+        glb g = write_glb(b, (tl_write_options){0});
+        double x = 12 / 30.0, one = sqrt(1 + x * x);
+        const double wanted[3] = {-x / one, 1 / one, 0};
+        for (size_t k = 0; k < count_of(&g, "NORMAL"); k++) {
+            int i, j;
+            double n[3], at[3];
+            attribute(&g, "POSITION", k, 3, at);
+            sample_of(b, &g, k, &i, &j);
+            normal_of(&g, k, n);
+            bool below = at[1] + of_node(&g, "translation", 1, 0) < 299 + 12 * i;
+            if (base && below)
+                assert_true(n[1] < 0);
+            else
+                assert_normal(n, wanted, 2e-7);
+        }
+        close_glb(&g);
+    }
+}
+
+static void othersGroundIsRefused(void **state)
+{
+    bench *b = *state;
+    tl_error error;
+    tl_source_info info = b->source->info;
+    info.width = WIDTH - 1;
+    tl_source *narrow = tl_array_source_create(b->heights, &info, NULL);
+    assert_int_equal(tl_write_mesh(b->mesh, b->path, &(tl_write_options){.ground = narrow}, &error), TL_ERROR_ARGUMENT);
+    assert_non_null(strstr(error.text, "not on this ground"));
+    tl_source_destroy(narrow);
+}
+
 int main(void)
 {
     const struct CMUnitTest tests[] = {
@@ -411,6 +681,12 @@ int main(void)
         cmocka_unit_test_setup_teardown(normalsAreThoseOfTheGround, setUp, tearDown),
         cmocka_unit_test_setup_teardown(texturesKeepTheirSize, setUp, tearDown),
         cmocka_unit_test_setup_teardown(partsJoin, setUp, tearDown),
+        cmocka_unit_test_setup_teardown(simplifiedMeshesHaveTheGroundsNormals, setUp, tearDown),
+        cmocka_unit_test_setup_teardown(planesAreEvenBesideVoids, setUp, tearDown),
+        cmocka_unit_test_setup_teardown(normalsStandOnTheEllipsoid, setUp, tearDown),
+        cmocka_unit_test_setup_teardown(fieldsHaveTheNormalsOfTheirLevels, setUp, tearDown),
+        cmocka_unit_test_setup_teardown(whatHangsBelowIsNoGround, setUp, tearDown),
+        cmocka_unit_test_setup_teardown(othersGroundIsRefused, setUp, tearDown),
         cmocka_unit_test_setup_teardown(whatHasNoMetresHasNoNormals, setUp, tearDown),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);

@@ -252,6 +252,25 @@ void out_frame_tangent(const out_frame *frame, double axes[3][3], double centre[
     memcpy(centre, frame->centre, sizeof frame->centre);
 }
 
+bool out_frame_place(const out_frame *frame, double i, double j, double z, double xyz[3])
+{
+    xyz[0] = i, xyz[1] = j, xyz[2] = z;
+    if (frame->kind != TL_FRAME_PIXEL)
+        position(frame->georef, i, j, &xyz[0], &xyz[1]);
+    if (frame_is_tangent(frame->kind)) {
+        double x = xyz[0], y = xyz[1];
+        dem_projection_to_lonlat(frame->projection, 1, &x, &y);
+        if (!isfinite(x) || !isfinite(y))
+            return false;
+        dem_local_frame_forward(frame->local, x, y, z * frame->georef->height_unit, xyz);
+    }
+    if (frame->kind == TL_FRAME_ECEF) {
+        const double enu[3] = {xyz[0], xyz[1], xyz[2]};
+        out_frame_to_ecef(frame, enu, xyz);
+    }
+    return isfinite(xyz[0]) && isfinite(xyz[1]) && isfinite(xyz[2]);
+}
+
 tl_status out_frame_apply(out_frame *frame, const tl_vertex *v, size_t n, double (*xyz)[3], tl_error *error)
 {
     tl_status status = TL_OK;

@@ -16,6 +16,8 @@ tl_frame out_frame_kind(const out_frame *frame);
 const double *out_frame_origin(const out_frame *frame);
 /* Coordinates of n vertices. TL_ERROR_DATA where one has none, as beyond the edge of a map of a hemisphere. */
 tl_status out_frame_apply(out_frame *frame, const tl_vertex *vertices, size_t n, double (*xyz)[3], tl_error *error);
+/* Coordinates of one place, between samples too, without any interpolation; false where it has none. */
+bool out_frame_place(const out_frame *frame, double i, double j, double z, double xyz[3]);
 /* Of an ENU or ECEF frame: its tangent plane's axes (east, north, up) and origin, geocentric. */
 void out_frame_tangent(const out_frame *frame, double axes[3][3], double centre[3]);
 void out_frame_to_ecef(const out_frame *frame, const double enu[3], double out[3]);

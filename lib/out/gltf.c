@@ -6,6 +6,7 @@
 #include "lib/base/parallel.h"
 #include "lib/base/size.h"
 #include "lib/out/frame.h"
+#include "lib/out/gltf_normals.h"
 #include "lib/out/out.h"
 #include "lib/out/texture.h"
 
@@ -61,12 +62,7 @@ typedef struct skin {
     float tangent[4], uv[2];
 } skin;
 
-enum { VIEWS = 8, AXES = 9 /* places along each side of the mesh where directions are known */ };
-
-/* Axes of the ground in the frame's own: along columns, and up. */
-typedef struct ground_axes {
-    double along[3], up[3];
-} ground_axes;
+enum { VIEWS = 8 };
 
 typedef struct model {
     tl_mesh_coding coding;
@@ -79,8 +75,8 @@ typedef struct model {
     skin *skins;   /* the same */
     unsigned textures;
     out_texture texture;
-    ground_axes *axes_at; /* AXES x AXES over the texture; NULL: no tangents */
-    double turn;          /* 1, or -1 where the frame is mirrored */
+    gltf_directions *directions; /* of the whole mesh, where any are asked for: borrowed */
+    bool tangents;
     int indices_view, morph_view, tangent_view, uv_view, image_view;
     size_t vertex_count;
     uint32_t *indices;
@@ -91,14 +87,6 @@ typedef struct model {
     double axes[3][3], centre[3]; /* of the tangent plane */
 } model;
 
-/* glTF's Y points up: (east, north, up) becomes (x, z up, -y). */
-static void to_gltf(const double in[3], double out[3])
-{
-    out[0] = in[0];
-    out[1] = in[2];
-    out[2] = -in[1];
-}
-
 static tl_status first_position(const tl_mesh *mesh, out_frame *frame, double origin[3], tl_error *error)
 {
     double xyz[1][3] = {{0}};
@@ -106,7 +94,7 @@ static tl_status first_position(const tl_mesh *mesh, out_frame *frame, double or
     /* a node's translation is exact in a reader that computes in double; map coordinates need it */
     if (mesh->vertex_count && out_frame_kind(frame) == TL_FRAME_PROJECTED)
         status = out_frame_apply(frame, mesh->vertices, 1, xyz, error);
-    to_gltf(xyz[0], origin);
+    gltf_turn(xyz[0], origin);
     return status;
 }
 
@@ -125,7 +113,7 @@ static tl_status place_vertices(const tl_mesh *mesh, out_frame *frame, model *m,
         for (size_t i = 0; i < n; i++) {
             double at[3];
             vertex placed = {{0}, {0}};
-            to_gltf(xyz[i], at);
+            gltf_turn(xyz[i], at);
             for (int a = 0; a < 3; a++) {
                 placed.position[a] = (float)(at[a] - m->origin[a]);
                 m->low[a] = fminf(m->low[a], placed.position[a]);
@@ -137,8 +125,8 @@ static tl_status place_vertices(const tl_mesh *mesh, out_frame *frame, model *m,
     return TL_OK;
 }
 
-/* Normals weighted by the triangles' areas. */
-static void add_normals(model *m)
+/* Normals of the triangles, weighted by their areas. */
+static void add_mesh_normals(model *m)
 {
     for (size_t t = 0; t < m->index_count; t += 3) {
         vertex *v[3];
@@ -163,6 +151,16 @@ static void add_normals(model *m)
     }
 }
 
+/* Those of the ground where that is at hand and known; m->vertices are in the mesh's order. */
+static tl_status add_normals(const tl_mesh *mesh, model *m, const tl_write_options *options, tl_error *error)
+{
+    add_mesh_normals(m);
+    if (!options->ground)
+        return TL_OK;
+    return gltf_ground_normals(mesh, options->ground, m->directions, options->run, m->vertices->normal,
+                               sizeof(vertex) / sizeof(float), error);
+}
+
 /* Fills m->morphs, of vertices in the mesh's order. */
 static tl_status place_morphs(const tl_mesh *mesh, out_frame *frame, const vertex *placed, model *m, tl_error *error)
 {
@@ -178,7 +176,7 @@ static tl_status place_morphs(const tl_mesh *mesh, out_frame *frame, const verte
         }
         status = out_frame_apply(frame, moved, n, xyz, error);
         for (size_t i = 0; i < n && status == TL_OK; i++) {
-            to_gltf(xyz[i], at);
+            gltf_turn(xyz[i], at);
             m->morphs[k + i].height = heights[k + i];
             for (int a = 0; a < 3; a++)
                 m->morphs[k + i].by[a] = (float)(at[a] - m->origin[a] - (double)placed[k + i].position[a]);
@@ -225,105 +223,31 @@ static tl_status order_vertices(model *m, const vertex *placed, const char *path
 
 /* ---- Textures ---- */
 
-static void difference(const double a[3], const double b[3], double out[3])
-{
-    for (int k = 0; k < 3; k++)
-        out[k] = a[k] - b[k];
-}
-
-static void cross(const double a[3], const double b[3], double out[3])
-{
-    for (int k = 0; k < 3; k++)
-        out[k] = a[(k + 1) % 3] * b[(k + 2) % 3] - a[(k + 2) % 3] * b[(k + 1) % 3];
-}
-
-static void scale_to_one(double v[3])
-{
-    double length = sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]);
-    for (int k = 0; k < 3 && length > 0; k++)
-        v[k] /= length;
-}
-
-/* Directions at a place of the mesh, by places one sample away; `height` makes no matter. */
-static tl_status find_axes(const tl_mesh *mesh, out_frame *frame, const out_texture *t, double u, double v,
-                           ground_axes *out, double *turn, tl_error *error)
-{
-    int32_t i = (int32_t)llrint((double)t->low[0] + u * (double)(t->high[0] - t->low[0]));
-    int32_t j = (int32_t)llrint((double)t->low[1] + v * (double)(t->high[1] - t->low[1]));
-    int32_t before[2] = {i > t->low[0] ? i - 1 : i, j > t->low[1] ? j - 1 : j};
-    int32_t behind[2] = {i < t->high[0] ? i + 1 : i, j < t->high[1] ? j + 1 : j};
-    float z = mesh->vertices[0].z;
-    const tl_vertex around[4] = {{before[0], j, z}, {behind[0], j, z}, {i, behind[1], z}, {i, before[1], z}};
-    double xyz[4][3], at[4][3], north[3], up[3];
-    tl_status status = out_frame_apply(frame, around, 4, xyz, error);
-    for (int k = 0; k < 4 && status == TL_OK; k++)
-        to_gltf(xyz[k], at[k]);
-    if (status != TL_OK)
-        return status;
-    difference(at[1], at[0], out->along);
-    difference(at[3], at[2], north);
-    scale_to_one(out->along);
-    scale_to_one(north);
-    cross(out->along, north, up);
-    scale_to_one(up);
-    *turn = up[1] < 0 ? -1 : 1;
-    for (int k = 0; k < 3; k++)
-        out->up[k] = *turn * up[k];
-    return TL_OK;
-}
-
-static tl_status find_all_axes(const tl_mesh *mesh, out_frame *frame, model *m, tl_error *error)
-{
-    tl_status status = TL_OK;
-    m->axes_at = tl_alloc(AXES * AXES, sizeof *m->axes_at);
-    if (!m->axes_at)
-        return tl_fail_memory(error, "the textures");
-    for (int k = 0; k < AXES * AXES && status == TL_OK; k++)
-        status = find_axes(mesh, frame, &m->texture, k % AXES / (AXES - 1.0), k / AXES / (AXES - 1.0), &m->axes_at[k],
-                           &m->turn, error);
-    return status;
-}
-
-/* Between the places where they are known: they turn by at most degrees over a whole raster. */
-static void mix_axes(const model *m, double u, double v, ground_axes *out)
-{
-    int x = u < 1 ? (int)(u * (AXES - 1)) : AXES - 2, y = v < 1 ? (int)(v * (AXES - 1)) : AXES - 2;
-    double a = u * (AXES - 1) - x, b = v * (AXES - 1) - y;
-    const ground_axes *at = m->axes_at + y * AXES + x;
-    for (int k = 0; k < 3; k++) {
-        out->along[k] = (1 - b) * ((1 - a) * at[0].along[k] + a * at[1].along[k]) +
-                        b * ((1 - a) * at[AXES].along[k] + a * at[AXES + 1].along[k]);
-        out->up[k] = (1 - b) * ((1 - a) * at[0].up[k] + a * at[1].up[k]) +
-                     b * ((1 - a) * at[AXES].up[k] + a * at[AXES + 1].up[k]);
-    }
-    scale_to_one(out->along);
-    scale_to_one(out->up);
-}
-
-static double share(int64_t low, int64_t high, int64_t at)
-{
-    return high > low ? (double)(at - low) / (double)(high - low) : 0;
-}
-
 /* Fills m->skins, of vertices in the mesh's order, and, where the texture has the normals, makes theirs point up. */
-static void place_skins(const tl_mesh *mesh, vertex *placed, model *m)
+static tl_status place_skins(const tl_mesh *mesh, vertex *placed, model *m, const char *path, tl_error *error)
 {
-    const out_texture *t = &m->texture;
     for (size_t k = 0; k < mesh->vertex_count; k++) {
         const tl_vertex *v = &mesh->vertices[k];
         skin *s = &m->skins[k];
+        gltf_direction d;
+        double up[3];
         *s = (skin){{0}, {0}};
-        out_texture_place(t, v->i, v->j, s->uv);
-        if (!m->axes_at)
+        out_texture_place(&m->texture, v->i, v->j, s->uv);
+        if (!m->tangents)
             continue;
-        ground_axes axes;
-        mix_axes(m, share(t->low[0], t->high[0], v->i), share(t->low[1], t->high[1], v->j), &axes);
+        if (!gltf_direction_at(m->directions, v->i, v->j, (double)v->z, &d))
+            return tl_fail(error, TL_ERROR_DATA, "%s: around column %d, row %d directions are not known; leave %s away",
+                           path, v->i, v->j, "the normal texture");
+        gltf_cross(d.down, d.along, up);
+        gltf_scale_to_one(d.along);
+        gltf_scale_to_one(d.up);
         for (int a = 0; a < 3; a++) {
-            placed[k].normal[a] = (float)axes.up[a];
-            s->tangent[a] = (float)axes.along[a];
+            placed[k].normal[a] = (float)d.up[a];
+            s->tangent[a] = (float)d.along[a];
         }
-        s->tangent[3] = (float)m->turn;
+        s->tangent[3] = up[0] * d.up[0] + up[1] * d.up[1] + up[2] * d.up[2] < 0 ? -1 : 1; /* -1: mirrored */
     }
+    return TL_OK;
 }
 
 /* Slopes in metres are no slopes where coordinates are none. */
@@ -338,7 +262,7 @@ static tl_status check_metres(const tl_mesh *mesh, const out_frame *frame, const
                    path);
 }
 
-static tl_status open_texture(const tl_mesh *mesh, out_frame *frame, model *m, const tl_write_options *options,
+static tl_status open_texture(const tl_mesh *mesh, const out_frame *frame, model *m, const tl_write_options *options,
                               const char *path, tl_error *error)
 {
     if (!options->ground || options->texture_size < 0)
@@ -349,8 +273,7 @@ static tl_status open_texture(const tl_mesh *mesh, out_frame *frame, model *m, c
         status = check_metres(mesh, frame, path, error);
     if (status == TL_OK)
         status = out_texture_open(mesh, options->ground, options->texture_size, &m->texture, error);
-    if (status == TL_OK && m->textures & TL_TEXTURE_NORMAL)
-        status = find_all_axes(mesh, frame, m, error);
+    m->tangents = m->textures & TL_TEXTURE_NORMAL;
     return status;
 }
 
@@ -400,9 +323,10 @@ static void order_triangles_for(const tl_mesh *mesh, const out_frame *frame, mod
 }
 
 /* `ready`: the vertices, placed, with their normals; NULL: they are placed here. */
-static tl_status build(const tl_mesh *mesh, out_frame *frame, model *m, const vertex *ready, bool morphs,
-                       const char *path, tl_error *error)
+static tl_status build(const tl_mesh *mesh, out_frame *frame, model *m, const vertex *ready,
+                       const tl_write_options *options, const char *path, tl_error *error)
 {
+    bool morphs = options->parent_heights;
     m->vertex_count = mesh->vertex_count;
     m->index_count = 3 * mesh->triangle_count;
     vertex *placed = tl_alloc(m->vertex_count, sizeof *placed);
@@ -422,10 +346,10 @@ static tl_status build(const tl_mesh *mesh, out_frame *frame, model *m, const ve
         take_vertices(ready, m);
     else
         status = place_vertices(mesh, frame, m, error);
-    if (status == TL_OK && !m->axes_at && !ready)
-        add_normals(m);
+    if (status == TL_OK && !m->tangents && !ready)
+        status = add_normals(mesh, m, options, error);
     if (status == TL_OK && m->textures)
-        place_skins(mesh, placed, m);
+        status = place_skins(mesh, placed, m, path, error);
     if (status == TL_OK && morphs)
         status = place_morphs(mesh, frame, placed, m, error);
     m->vertices = ordered;
@@ -535,11 +459,11 @@ static bool add_skins(model *m)
     bool plain = m->coding == TL_CODING_PLAIN;
     view *tangents = NULL, *places;
     m->tangent_view = m->view_count;
-    if (m->axes_at)
+    if (m->tangents)
         tangents = add_view(m, m->vertex_count, plain ? 16 : 8, ARRAY_BUFFER, "ATTRIBUTES");
     m->uv_view = m->view_count;
     places = add_view(m, m->vertex_count, plain ? 8 : 4, ARRAY_BUFFER, "ATTRIBUTES");
-    if (!places || (m->axes_at && !tangents))
+    if (!places || (m->tangents && !tangents))
         return false;
     for (size_t k = 0; k < m->vertex_count; k++) {
         const skin *s = &m->skins[k];
@@ -550,7 +474,7 @@ static bool add_skins(model *m)
             uv[a] = (uint16_t)lrintf(s->uv[a] * STEPS);
         for (int a = 0; a < 3; a++) /* a reader turns them by the node's scale */
             t[a] = (double)s->tangent[a] / (plain ? 1 : m->step[a]);
-        scale_to_one(t);
+        gltf_scale_to_one(t);
         for (int a = 0; a < 3; a++)
             tangent[a] = (int16_t)lrint(32767 * t[a]);
         tangent[3] = s->tangent[3] < 0 ? -32767 : 32767;
@@ -603,7 +527,6 @@ static void free_model(model *m)
     }
     if (m->texture.ground)
         out_texture_close(&m->texture);
-    free(m->axes_at);
     free(m->skins);
     free(m->vertices);
     free(m->morphs);
@@ -700,7 +623,7 @@ static json_t *accessors(const model *m)
         json_array_append_new(list, by);
         json_array_append_new(list, accessor(m->morph_view, 12, COMPONENT_FLOAT, m->vertex_count, "SCALAR"));
     }
-    if (m->axes_at)
+    if (m->tangents)
         json_array_append_new(list, normalized(m, accessor(m->tangent_view, 0, plain ? COMPONENT_FLOAT : COMPONENT_I16,
                                                            m->vertex_count, "VEC4")));
     if (m->skins)
@@ -771,14 +694,14 @@ static json_t *geocentric_matrix(const model *m, const double corner[3])
     json_t *matrix = json_array();
     memcpy(place, m->centre, sizeof place);
     for (int c = 0; c < 3; c++) {
-        to_gltf(axes[c], turned);
+        gltf_turn(axes[c], turned);
         for (int a = 0; a < 3; a++) {
             json_array_append_new(matrix, json_real(sign[c] * step[c] * turned[a]));
             place[a] += sign[c] * corner[c] * axes[c][a];
         }
         json_array_append_new(matrix, json_real(0));
     }
-    to_gltf(place, turned);
+    gltf_turn(place, turned);
     for (int a = 0; a < 3; a++)
         json_array_append_new(matrix, json_real(turned[a]));
     json_array_append_new(matrix, json_real(1));
@@ -823,7 +746,7 @@ static void add_textures(const model *m, json_t *root)
     json_t *surface = json_object_get(material, "pbrMetallicRoughness");
     json_t *images = json_array(), *textures = json_array();
     int next = m->morphs ? 5 : 3, count = 0; /* accessors */
-    if (m->axes_at)
+    if (m->tangents)
         json_object_set_new(attributes, "TANGENT", json_integer(next++));
     json_object_set_new(attributes, "TEXCOORD_0", json_integer(next));
     if (m->textures & TL_TEXTURE_COLOUR) {
@@ -926,7 +849,7 @@ static tl_status write_model(const tl_mesh *mesh, out_frame *frame, const model 
     if (m.textures)
         status = open_texture(mesh, frame, &m, options, path, error);
     if (status == TL_OK)
-        status = build(mesh, frame, &m, ready, options->parent_heights, path, error);
+        status = build(mesh, frame, &m, ready, options, path, error);
     if (status == TL_OK)
         status = make_views(&m, path, error);
     if (status == TL_OK && m.textures)
@@ -958,6 +881,10 @@ static tl_status begin(const tl_mesh *mesh, const char *path, const tl_write_opt
         .coding = options->coding, .level_steps = out_frame_kind(*frame) == TL_FRAME_PIXEL, .geocentric = geocentric};
     start->textures = options->textures & (TL_TEXTURE_COLOUR | TL_TEXTURE_NORMAL);
     out_frame_tangent(*frame, start->axes, start->centre);
+    if (options->ground)
+        start->directions = gltf_directions_create(mesh, *frame, path, error);
+    if (options->ground && !start->directions)
+        return TL_ERROR_MEMORY;
     return first_position(mesh, *frame, start->origin, error);
 }
 
@@ -969,11 +896,12 @@ tl_status out_gltf_write(const tl_mesh *mesh, tl_output *output, const tl_write_
     if (options->coding != TL_CODING_COMPRESSED &&
         (double)mesh->vertex_count * least + (double)mesh->triangle_count * 6 > UINT32_MAX)
         return too_large(path, mesh->triangle_count, error);
-    model start;
+    model start = {.directions = NULL};
     out_frame *frame = NULL;
     tl_status status = begin(mesh, path, options, &frame, &start, error);
     if (status == TL_OK)
         status = write_model(mesh, frame, &start, NULL, options, output, error);
+    gltf_directions_destroy(start.directions);
     out_frame_destroy(frame);
     return status;
 }
@@ -1056,8 +984,9 @@ static tl_status order_triangles(parts *p, const char *path, tl_error *error)
     return TL_OK;
 }
 
-/* All vertices in the frame of the whole, with normals by all triangles: so the parts join. */
-static tl_status place_all(parts *p, out_frame *frame, const model *start, const char *path, tl_error *error)
+/* All vertices in the frame of the whole, with normals of the ground or by all triangles: so the parts join. */
+static tl_status place_all(parts *p, out_frame *frame, const model *start, const char *path,
+                           const tl_write_options *options, tl_error *error)
 {
     model m = *start;
     m.vertex_count = p->mesh->vertex_count;
@@ -1069,7 +998,7 @@ static tl_status place_all(parts *p, out_frame *frame, const model *start, const
     order_triangles_for(p->mesh, frame, &m); /* sums of normals depend on it */
     tl_status status = place_vertices(p->mesh, frame, &m, error);
     if (status == TL_OK)
-        add_normals(&m);
+        status = add_normals(p->mesh, &m, options, error);
     free(m.indices);
     return status;
 }
@@ -1170,7 +1099,7 @@ tl_status out_gltf_write_parts(const tl_mesh *mesh, const char *path, const tl_w
     if (options->coding != TL_CODING_PLAIN || options->parent_heights)
         return tl_fail(error, TL_ERROR_ARGUMENT,
                        "%s: parts have floats, so that they join, and no heights of parents; leave these away", path);
-    model start;
+    model start = {.directions = NULL};
     out_frame *frame = NULL;
     parts p = {.mesh = mesh};
     size_t most = 0;
@@ -1183,13 +1112,14 @@ tl_status out_gltf_write_parts(const tl_mesh *mesh, const char *path, const tl_w
     if (status == TL_OK)
         status = make_room(&p, most, path, error);
     if (status == TL_OK)
-        status = place_all(&p, frame, &start, path, error);
+        status = place_all(&p, frame, &start, path, options, error);
     size_t tile = 0, tiles = (size_t)(p.across * p.across);
     for (; status == TL_OK && tile < tiles; tile++)
         if (p.first[tile + 1] > p.first[tile])
             status = write_part(&p, tile, frame, &start, path, options, error);
     if (status != TL_OK && tile)
         remove_parts(&p, tile - 1, path, options);
+    gltf_directions_destroy(start.directions);
     out_frame_destroy(frame);
     free(p.first);
     free(p.order);

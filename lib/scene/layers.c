@@ -186,16 +186,6 @@ static inline double height_at(const patch *p, int64_t x, int64_t y)
     return (double)p->heights[(y + 1) * (p->window.width + 2) + x + 1];
 }
 
-/* Slope by both neighbours, by the one that is there, or level. */
-static double slope_of(double before, double here, double behind, double step)
-{
-    if (!isnan(before) && !isnan(behind))
-        return (behind - before) / (2 * step);
-    if (!isnan(behind))
-        return (behind - here) / step;
-    return isnan(before) ? 0 : (here - before) / step;
-}
-
 static double bend_of(double before, double here, double behind, double step)
 {
     double bend = ((before - here) + (behind - here)) / (step * step);
@@ -230,8 +220,8 @@ static spot spot_at(const scene_layer *layer, const patch *p, int64_t x, int64_t
     double cross = height_at(p, x + 1, y - 1) - height_at(p, x - 1, y - 1) - height_at(p, x + 1, y + 1) +
                    height_at(p, x - 1, y + 1);
     spot at = {.z = z / layer->heights->info.georef.height_unit,
-               .east = slope_of(west, z, east, dx),
-               .north = slope_of(down, z, up, dy),
+               .east = scene_slope(west, z, east, dx),
+               .north = scene_slope(down, z, up, dy),
                .sigma = layer->needs_sigma ? layer->sigma * strength_at(p, x, y) : (double)NAN,
                .hurst = layer->needs_hurst ? strength_at(p, x, y) : (double)NAN};
     at.curvature = curvature_of(at.east, at.north, bend_of(west, z, east, dx), isnan(cross) ? 0 : cross / (4 * dx * dy),

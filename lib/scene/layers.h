@@ -6,6 +6,8 @@
 
 #include "lib/talus.h"
 
+#include <math.h>
+
 enum { SCENE_LAYER_CHANNELS = 4 }; /* at most */
 
 typedef struct scene_layer scene_layer;
@@ -20,5 +22,15 @@ void scene_layer_destroy(scene_layer *layer);
 const tl_layer_kind *scene_layer_kind(const scene_layer *layer);
 /* The window's values, channel by channel; NaN where the height is void. Any number of threads. */
 tl_status scene_layer_read(const scene_layer *layer, tl_window window, float *out, tl_error *error);
+
+/* Slope by both neighbours, `step` away, by the one that is there, or level. */
+static inline double scene_slope(double before, double here, double behind, double step)
+{
+    if (!isnan(before) && !isnan(behind))
+        return (behind - before) / (2 * step);
+    if (!isnan(behind))
+        return (behind - here) / step;
+    return isnan(before) ? 0 : (here - before) / step;
+}
 
 #endif

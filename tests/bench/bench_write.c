@@ -86,7 +86,7 @@ static void time_grid(work *self, const char *name, const char *ending, tl_write
 static void time_mesh(work *self, const char *name, tl_mesh_coding coding)
 {
     snprintf(self->path, sizeof self->path, "%s/bench-write.glb", self->folder);
-    self->options = (tl_write_options){.coding = coding};
+    self->options = (tl_write_options){.coding = coding, .ground = self->source};
     double seconds = bench_minimum(write_mesh, self, 1);
     struct rusage used;
     getrusage(RUSAGE_SELF, &used);
@@ -103,11 +103,14 @@ static void time_meshes(work *self, const tl_source_info *info)
     tl_mesh *mesh = NULL;
     if (!source || tl_mesh_from_source(source, NULL, &mesh, NULL) != TL_OK)
         failed("mesh");
+    const tl_source *whole = self->source;
     self->mesh = mesh;
+    self->source = source;
     printf("\n%zu triangles    MB        s\n", mesh->triangle_count);
     time_mesh(self, "glb", TL_CODING_PLAIN);
     time_mesh(self, "glb quantized", TL_CODING_QUANTIZED);
     time_mesh(self, "glb meshopt", TL_CODING_COMPRESSED);
+    self->source = whole;
     tl_mesh_destroy(mesh);
     tl_source_destroy(source);
 }
