@@ -4,12 +4,14 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { FORMAT_QUANTIZED_MESH };
-static const char *const formats[] = {[FORMAT_QUANTIZED_MESH] = "quantized-mesh", NULL};
+static const char *const formats[] = {[TL_TILES_QUANTIZED_MESH] = "quantized-mesh", [TL_TILES_3D] = "3dtiles", NULL};
+
+enum { CODING_QUANTIZED, CODING_COMPRESSED };
+static const char *const codings[] = {[CODING_QUANTIZED] = "quantized", [CODING_COMPRESSED] = "compressed", NULL};
 
 typedef struct settings {
     common common;
-    int format;
+    int format, coding;
     double max_error;
     int64_t extra, seed;
     const char *levels, *shard, *attribution;
@@ -88,9 +90,9 @@ static void report(const settings *set, const tl_tiles_report *r, double seconds
         bytes += r->levels[k].bytes;
     }
     if (set->dry_run) {
-        command_say(&set->common, "%s: at most %llu tiles of levels %d ... %d from %llu blocks; cells of %.3g degrees",
+        command_say(&set->common, "%s: at most %llu tiles of levels %d ... %d from %llu blocks; cells of %.3g %s",
                     folder, (unsigned long long)tiles, r->first_level, r->last_level, (unsigned long long)r->blocks,
-                    r->spacing);
+                    r->spacing, set->format == TL_TILES_3D ? "m" : "degrees");
         return;
     }
     if (r->complete && !tiles) {
@@ -102,8 +104,10 @@ static void report(const settings *set, const tl_tiles_report *r, double seconds
             command_say(&set->common, "level %-3d %8llu tiles %10llu triangles %11llu bytes, error <= %.4g m", k,
                         (unsigned long long)r->levels[k].tiles, (unsigned long long)r->levels[k].triangles,
                         (unsigned long long)r->levels[k].bytes, r->levels[k].error + r->resampling);
-    command_say(&set->common, "of each error, %.4g m are between the DEM's samples and the deepest lattice's surface",
-                r->resampling);
+    if (set->format == TL_TILES_QUANTIZED_MESH)
+        command_say(&set->common,
+                    "of each error, %.4g m are between the DEM's samples and the deepest lattice's surface",
+                    r->resampling);
     command_say(&set->common, "%s: %llu tiles, %llu bytes, %.2f s%s", folder, (unsigned long long)tiles,
                 (unsigned long long)bytes, seconds, r->complete ? "" : "; not complete until --finish");
 }
@@ -153,6 +157,14 @@ static bool output_ok(const settings *set)
     return false;
 }
 
+static bool format_ok(const settings *set)
+{
+    if (set->format == TL_TILES_3D || set->coding == CODING_QUANTIZED)
+        return true;
+    complain("--coding is for --format 3dtiles");
+    return false;
+}
+
 static int run_tiles(const command *self, int argc, const char **argv, bool help)
 {
     settings set = {0};
@@ -169,6 +181,9 @@ static int run_tiles(const command *self, int argc, const char **argv, bool help
         {"levels", 'l', OPTION_TEXT, &set.levels, NULL, "A..B",
          "of tiles (default: from 0 to the first whose cells are, at the equator, no larger than the DEM's in metres)",
          0, 0, NULL},
+        {"coding", 0, OPTION_CHOICE, &set.coding, NULL, "CODING",
+         "of 3dtiles: quantized (default), or compressed by EXT_meshopt_compression, for readers that know it", 0, 0,
+         codings},
         {"no-normals", 0, OPTION_FLAG, &set.no_normals, NULL, NULL, "leave the vertices' normals away", 0, 0, NULL},
         {"outside", 0, OPTION_NUMBER, &set.outside, NULL, "METRES",
          "height of ground that the DEM does not know (default: 0)", -1e5, 1e5, NULL},
@@ -196,14 +211,17 @@ static int run_tiles(const command *self, int argc, const char **argv, bool help
     int status;
     if (!command_begin(self, argc, argv, help, groups, -1, &rest, &status))
         return status;
-    tl_tiles_options options = {.max_error = set.max_error,
+    tl_tiles_options options = {.format = (tl_tiles_format)set.format,
+                                .coding = set.coding == CODING_COMPRESSED ? TL_CODING_COMPRESSED : TL_CODING_QUANTIZED,
+                                .max_error = set.max_error,
                                 .no_normals = set.no_normals,
                                 .outside = set.outside,
                                 .attribution = set.attribution,
                                 .resume = set.resume,
                                 .finish = set.finish,
                                 .dry_run = set.dry_run};
-    bool good = output_ok(&set) && read_levels(set.levels, &options) && read_shard(set.shard, &options);
+    bool good =
+        output_ok(&set) && format_ok(&set) && read_levels(set.levels, &options) && read_shard(set.shard, &options);
     status = good ? make_tiles(&set, &rest, &options) : EXIT_USAGE;
     arguments_free(&rest);
     return status;

@@ -1201,7 +1201,15 @@ TL_API tl_status tl_write_preset(const tl_source *source, const char *path, cons
 
 enum { TL_TILE_LEVELS = 25 };
 
+typedef enum tl_tiles_format {
+    TL_TILES_QUANTIZED_MESH, /* quantized-mesh 1.0, for globes: see tl_write_terrain_tiles */
+    TL_TILES_3D,             /* 3D Tiles 1.1: implicit tiling, GLB */
+} tl_tiles_format;
+
 typedef struct tl_tiles_options {
+    tl_tiles_format format;
+    tl_mesh_coding coding; /* of 3D Tiles: steps of 16 bits, unless TL_CODING_COMPRESSED encodes these */
+    unsigned textures;     /* of 3D Tiles: bits of tl_texture */
     /* Largest vertical distance, in metres, of the tiles of the deepest level from the heights on their lattice, > 0;
      * it doubles from level to level upwards. 0: a quarter of what globes take the level for, 77067 m / 2^level. */
     double max_error;
@@ -1233,18 +1241,25 @@ typedef struct tl_tiles_report {
     /* Metres: the largest difference between the source's samples and the surface over the deepest lattice; it comes on
      * top of the levels' errors. */
     double resampling;
-    double spacing;               /* of the deepest lattice, degrees */
+    double spacing;               /* of the deepest lattice: degrees; metres of 3D Tiles */
     uint64_t blocks, done_before; /* of the work; those that an earlier call had done */
-    bool complete;                /* the pyramid can be shown: layer.json is there */
+    bool complete;                /* the pyramid can be shown: layer.json or tileset.json is there */
 } tl_tiles_report;
 
-/* Writes a source as a pyramid of quantized-mesh 1.0 tiles for globes: FOLDER/LEVEL/COLUMN/ROW.terrain in the
- * geographic scheme (EPSG:4326, rows from the south), gzipped, and FOLDER/layer.json. The folder must be empty or not
- * there, unless resume, shards or finish go on with it. Heights are taken as above the ellipsoid (see
- * tl_geoid_create). The deepest level is 64 x 64 cells of the lattice a tile, onto which the source is interpolated by
- * a cubic; levels above are drawn from every second vertex of the next ones, and count what these leave out. Tiles of
- * one level share the vertices of their edges. Takes some 64 MB a worker. TL_ERROR_ARGUMENT where it is not known
- * where the source lies. */
+/* Writes a source as a pyramid of tiles for globes. Heights are taken as above the ellipsoid (see tl_geoid_create).
+ * The folder must be empty or not there, unless resume, shards or finish go on with it. Levels above the deepest are
+ * drawn from every second vertex of the next ones, and count what these leave out. Tiles of one level share the
+ * vertices of their edges. Takes some 64 MB a worker. TL_ERROR_ARGUMENT where it is not known where the source lies.
+ *
+ * TL_TILES_QUANTIZED_MESH: quantized-mesh 1.0, FOLDER/LEVEL/COLUMN/ROW.terrain in the geographic scheme (EPSG:4326,
+ * rows from the south), gzipped, and FOLDER/layer.json. The deepest level is 64 x 64 cells of the lattice a tile, onto
+ * which the source is interpolated by a cubic.
+ *
+ * TL_TILES_3D: 3D Tiles 1.1, FOLDER/content/LEVEL/COLUMN/ROW.glb of the implicit quadtree over the source's own
+ * lattice, 64 x 64 of its cells a tile of the last level, with FOLDER/subtrees and FOLDER/tileset.json: nothing is
+ * resampled, any CRS will do, and voids are holes, whose rims move by up to a cell of a level. Its report's last level
+ * is that of the samples; options->last_level, if given, must be it, and `outside` says nothing. Every tile has a
+ * region that holds it and all below it, and as its geometric error the greatest of theirs. */
 TL_API tl_status tl_write_terrain_tiles(const tl_source *source, const char *folder, const tl_tiles_options *options,
                                         tl_tiles_report *out, tl_error *error);
 

@@ -18,7 +18,7 @@ enum {
     VALUES_BYTES = 4 * HEIGHTS + 2 * CELLS,
     QUICK = 1,
     MOST_TILES = 1 << 12,
-    MAGIC = 0x32504c54
+    MAGIC = 0x33504c54
 };
 
 /* At the head of a file; all in the machine's own order, for a piece stays where it was made. */

@@ -11,10 +11,11 @@ enum { OUT_PIECE = SCENE_BLOCK / 2, OUT_PIECE_ROW = OUT_PIECE + 1 }; /* cells an
 
 typedef struct out_piece_tile {
     int32_t level;
-    uint32_t checksum; /* CRC-32 of the file */
-    int64_t column, row, bytes;
+    uint32_t checksum;          /* CRC-32 of the file */
+    int64_t column, row, bytes; /* bytes 0: it has no file */
     uint64_t triangles, vertices;
-    double error; /* metres, a bound */
+    double error;     /* metres, a bound */
+    double region[6]; /* west, south, east, north (radians), lowest and highest height; not of all schemes */
 } out_piece_tile;
 
 typedef struct out_piece {

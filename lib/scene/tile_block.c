@@ -151,6 +151,12 @@ static uint32_t number_of(const drawing *d, place p)
     return (uint32_t)*number;
 }
 
+static bool is_void(const drawing *d, place a, place b, place c)
+{
+    const float *z = d->block->z + (size_t)d->y * ROW + (size_t)d->x;
+    return isnan(z[a.j * ROW + a.i]) || isnan(z[b.j * ROW + b.i]) || isnan(z[c.j * ROW + c.i]);
+}
+
 /* The triangle a, b, c, counter-clockwise, with its right angle at a. */
 static void draw_triangle(const drawing *d, place a, place b, place c, int size)
 {
@@ -163,8 +169,12 @@ static void draw_triangle(const drawing *d, place a, place b, place c, int size)
             draw_triangle(d, middle, c, a, size - 1);
             return;
         }
+        if (is_void(d, a, b, c))
+            return;
         mesh->error = error > mesh->error ? error : mesh->error;
-    } else if (d->block->lost) {                                  /* half a cell, of which finer lattices know more */
+    } else if (is_void(d, a, b, c))
+        return;
+    else if (d->block->lost) {                                    /* half a cell, of which finer lattices know more */
         int x = (a.i + b.i + c.i) / 3, y = (a.j + b.j + c.j) / 3; /* rounds down into it */
         double lost = (double)d->block->lost[(size_t)(d->y + y) * SIDE + (size_t)(d->x + x)];
         mesh->lost = lost > mesh->lost ? lost : mesh->lost;

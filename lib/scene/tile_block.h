@@ -23,7 +23,7 @@ enum {
 };
 
 typedef struct scene_block {
-    float *z;      /* SCENE_BLOCK_VERTICES^2 heights from the south-western corner of the rim, none NaN */
+    float *z;      /* SCENE_BLOCK_VERTICES^2 heights from the south-western corner of the rim; NaN: void */
     float *lost;   /* SCENE_BLOCK_SIDE^2, a cell each: how far finer lattices are from it; NULL: nothing is lost */
     float *errors; /* by vertex, filled in by scene_block_measure */
 } scene_block;
@@ -51,7 +51,9 @@ typedef struct scene_tile_mesh {
 tl_status scene_tile_mesh_init(scene_tile_mesh *mesh, tl_error *error);
 void scene_tile_mesh_finish(scene_tile_mesh *mesh);
 
-/* Draws the tile of `cells` cells (a power of two) whose first vertex is vertex (x, y) of the block. limits[size]: the
+/* Triangles with voids among their samples are split down to the cells, and those that have one are left out.
+ *
+ * Draws the tile of `cells` cells (a power of two) whose first vertex is vertex (x, y) of the block. limits[size]: the
  * greatest error that a vertex which splits triangles of this size may leave. */
 void scene_tile_draw(const scene_block *block, int x, int y, int cells, const double limits[SCENE_TILE_SIZES],
                      scene_tile_mesh *mesh);
