@@ -186,7 +186,7 @@ static bool set_ellipsoid(GTIF *keys, const tl_crs *crs)
            set_double(keys, GeogPrimeMeridianLongGeoKey, dem_crs_prime_meridian(crs));
 }
 
-/* A map without a code: its definition in the words of ESRI, which GDAL understands too. */
+/* A map without a code: its definition in the words of ESRI, which GDAL reads where the model is the user's own. */
 static bool set_definition(GTIF *keys, const tl_crs *crs)
 {
     static const char mark[] = "ESRI PE String = ";
@@ -196,7 +196,8 @@ static bool set_definition(GTIF *keys, const tl_crs *crs)
     if (text)
         snprintf(text, room, "%s%s", mark, definition);
     bool good =
-        !text || (set_short(keys, ProjectedCSTypeGeoKey, KvUserDefined) && set_text(keys, PCSCitationGeoKey, text));
+        !text || (set_short(keys, GTModelTypeGeoKey, KvUserDefined) &&
+                  set_short(keys, ProjectedCSTypeGeoKey, KvUserDefined) && set_text(keys, PCSCitationGeoKey, text));
     free(definition);
     free(text);
     return good;
