@@ -40,7 +40,74 @@ typedef struct settings {
     const char *hurst_map, *delta_map, *sigma_map;
     const char *same_as; /* an output to be made again */
     const char *record;  /* of the command line */
+    char **files;        /* what was written, by the names that it has or had; see written() */
+    size_t file_count;
 } settings;
+
+/* One more file that was written; takes the name. Out of memory it is forgotten. */
+static void written(settings *set, char *path)
+{
+    char **more = path ? realloc(set->files, (set->file_count + 1) * sizeof *more) : NULL;
+    if (!more) {
+        free(path);
+        return;
+    }
+    set->files = more;
+    set->files[set->file_count++] = path;
+}
+
+/* The output's name with something else in place of its ending; to be freed. */
+static char *name_beside(const settings *set, const char *instead)
+{
+    const char *output = set->common.output, *dot = strrchr(output, '.');
+    size_t stem = dot ? (size_t)(dot - output) : strlen(output), room = stem + strlen(instead) + 1;
+    char *path = malloc(room);
+    if (path)
+        snprintf(path, room, "%.*s%s", (int)stem, output, instead);
+    return path;
+}
+
+/* The heights' file and what is written beside it under any name; those that are not there do not matter. */
+static void note_output(settings *set)
+{
+    const char *output = set->common.output;
+    size_t room = strlen(output) + sizeof ".json";
+    char *json = malloc(room);
+    if (json)
+        snprintf(json, room, "%s.json", output);
+    written(set, strdup(output));
+    if (command_ends_with(output, ".r16") || command_ends_with(output, ".raw"))
+        written(set, json);
+    else
+        free(json);
+    if (command_ends_with(output, ".png") || set->preset)
+        written(set, name_beside(set, ".json"));
+    if (set->common.voids && strcmp(set->common.voids, "keep") != 0)
+        written(set, name_beside(set, ".validity.tif"));
+}
+
+static void note_tiles(settings *set, const tl_preset_report *report)
+{
+    for (int64_t k = 0; k < report->columns * report->rows && report->columns * report->rows > 1; k++) {
+        char tile[64];
+        snprintf(tile, sizeof tile, "_x%lld_y%lld%s", (long long)(k % report->columns),
+                 (long long)(k / report->columns), strrchr(set->common.output, '.'));
+        written(set, name_beside(set, tile));
+    }
+}
+
+/* Compares with the file of --same-as, and lets go of the names. */
+static int compare_same(settings *set, const arguments *rest, int status)
+{
+    if (status == EXIT_DONE && set->same_as) {
+        note_output(set);
+        status = same_as_compare(set->same_as, &set->common, rest, set->files, set->file_count);
+    }
+    for (size_t k = 0; k < set->file_count; k++)
+        free(set->files[k]);
+    free(set->files);
+    return status;
+}
 
 static void report(const settings *set, const tl_source *made, double seconds)
 {
@@ -53,7 +120,7 @@ static void report(const settings *set, const tl_source *made, double seconds)
 }
 
 /* Writes what a preset asks for, and tells what to type into its importer. */
-static tl_status write_preset(const settings *set, const tl_source *made, const tl_run *run, tl_error *error)
+static tl_status write_preset(settings *set, const tl_source *made, const tl_run *run, tl_error *error)
 {
     const tl_preset_options options = {
         .preset = set->preset, .tile = set->tile, .overwrite = set->common.overwrite, .run = run};
@@ -61,6 +128,7 @@ static tl_status write_preset(const settings *set, const tl_source *made, const 
     tl_status status = tl_write_preset(made, set->common.output, &options, &report, error);
     if (status != TL_OK)
         return status;
+    note_tiles(set, &report);
     double share = (double)report.window.width * (double)report.window.height /
                    ((double)made->info.width * (double)made->info.height);
     command_say(&set->common,
@@ -73,7 +141,7 @@ static tl_status write_preset(const settings *set, const tl_source *made, const 
     return TL_OK;
 }
 
-static tl_status write_samples(const settings *set, const tl_source *made, const tl_run *run, tl_error *error)
+static tl_status write_samples(settings *set, const tl_source *made, const tl_run *run, tl_error *error)
 {
     if (set->preset)
         return write_preset(set, made, run, error);
@@ -118,8 +186,8 @@ static tl_status write_together(const settings *set, const tl_source *heights, c
 }
 
 /* With the command line in the record, from which --same-as makes it again. */
-static tl_status write_recorded(const settings *set, const tl_source *heights, const tl_source *surface,
-                                const tl_run *run, tl_error *error)
+static tl_status write_recorded(settings *set, const tl_source *heights, const tl_source *surface, const tl_run *run,
+                                tl_error *error)
 {
     const tl_parameter line = {"command", set->record};
     tl_source *made = tl_recorded_create(heights, &line, set->record ? 1 : 0, error);
@@ -130,7 +198,7 @@ static tl_status write_recorded(const settings *set, const tl_source *heights, c
     return status;
 }
 
-static tl_status write_grid(const settings *set, const tl_source *made, const tl_run *run, tl_error *error)
+static tl_status write_grid(settings *set, const tl_source *made, const tl_run *run, tl_error *error)
 {
     tl_source *steps = set->quantum_given ? tl_quantized_create(made, set->quantum, error) : NULL;
     if (set->quantum_given && !steps)
@@ -163,8 +231,7 @@ static char *layer_path(const settings *set, const char *kind)
     return path;
 }
 
-static tl_status write_layer(const settings *set, const tl_source *made, const char *kind, const tl_run *run,
-                             tl_error *error)
+static tl_status write_layer(settings *set, const tl_source *made, const char *kind, const tl_run *run, tl_error *error)
 {
     const tl_layer_options options = {.rules = set->layer_rules,
                                       .overwrite = set->common.overwrite,
@@ -176,9 +243,11 @@ static tl_status write_layer(const settings *set, const tl_source *made, const c
         return TL_ERROR_MEMORY;
     }
     tl_status status = tl_write_layer(made, kind, path, &options, error);
-    if (status == TL_OK)
+    if (status == TL_OK) {
         command_say(&set->common, "%s", path);
-    free(path);
+        written(set, path);
+    } else
+        free(path);
     return status;
 }
 
@@ -206,8 +275,7 @@ static tl_status check_layers(const settings *set, const tl_source *made, tl_err
     return status;
 }
 
-static tl_status write_layers(const settings *set, const tl_source *made, const tl_run *run, progress *bar,
-                              tl_error *error)
+static tl_status write_layers(settings *set, const tl_source *made, const tl_run *run, progress *bar, tl_error *error)
 {
     char *list = set->layers && !set->one_file ? strdup(set->layers) : NULL, *rest;
     tl_status status = TL_OK;
@@ -221,7 +289,7 @@ static tl_status write_layers(const settings *set, const tl_source *made, const 
     return status;
 }
 
-static int write_out(const settings *set, const tl_source *made, const tl_run *run, progress *bar)
+static int write_out(settings *set, const tl_source *made, const tl_run *run, progress *bar)
 {
     tl_error error;
     progress_stage(bar, "synthesis");
@@ -690,8 +758,7 @@ static int run_synth(const command *self, int argc, const char **argv, bool help
     set.field.seed = (uint64_t)set.seed;
     set.field.support = (tl_support)set.support;
     status = synth_ok(&set) ? synth(&set, &rest) : EXIT_USAGE;
-    if (status == EXIT_DONE && set.same_as)
-        status = same_as_compare(set.same_as, &set.common, &rest);
+    status = compare_same(&set, &rest, status);
     arguments_free(&rest);
     return status;
 }
@@ -751,8 +818,7 @@ static int run_noise(const command *self, int argc, const char **argv, bool help
     bool good = (!set.noise.scheme || names_scheme(set.noise.scheme, true)) &&
                 command_output_ok(&set.common, true, true) && grid_output_ok(&set);
     status = good ? noise(&set) : EXIT_USAGE;
-    if (status == EXIT_DONE && set.same_as)
-        status = same_as_compare(set.same_as, &set.common, &rest);
+    status = compare_same(&set, &rest, status);
     arguments_free(&rest);
     return status;
 }

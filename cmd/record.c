@@ -4,8 +4,6 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { LIMIT = 4000 };
-
 size_t record_value_size(const option *o)
 {
     switch (o->kind) {
@@ -56,37 +54,18 @@ static bool names_a_file(const option *o)
     return is_one_of(o->name, names);
 }
 
-typedef struct line {
-    char text[LIMIT + 1];
-    size_t used;
-    bool full;
-} line;
-
-static void put(line *to, const char *text)
-{
-    size_t length = strlen(text);
-    to->full = to->full || to->used + length > LIMIT;
-    if (to->full)
-        return;
-    memcpy(to->text + to->used, text, length + 1);
-    to->used += length;
-}
-
 /* A word as a shell, and popt, read it. */
-static void put_word(line *to, const char *word)
+static void put_word(FILE *to, const char *word)
 {
     static const char plain[] = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_./:,@%+=-";
-    put(to, " ");
     if (*word && word[strspn(word, plain)] == 0) {
-        put(to, word);
+        fprintf(to, " %s", word);
         return;
     }
-    put(to, "\"");
-    for (; *word; word++) {
-        const char one[3] = {'\\', *word, 0};
-        put(to, strchr("\"\\", *word) ? one : one + 1);
-    }
-    put(to, "\"");
+    fputs(" \"", to);
+    for (; *word; word++)
+        fprintf(to, strchr("\"\\", *word) ? "\\%c" : "%c", *word);
+    fputc('"', to);
 }
 
 /* The shortest digits that read back as this number. */
@@ -105,7 +84,7 @@ static const char *without_folders(const char *path)
     return slash && slash[1] ? slash + 1 : path;
 }
 
-static void put_value(line *to, const option *o, const option_value *value)
+static void put_value(FILE *to, const option *o, const option_value *value)
 {
     char text[160] = "", one[32];
     size_t parts = record_value_size(o) / sizeof(double); /* as large as an int64_t */
@@ -138,25 +117,41 @@ static bool is_default(const option *o, const option_value *now, const option_va
     return !(o->given && *o->given) && memcmp(now, before, record_value_size(o)) == 0;
 }
 
+/* A name without folders; one that would be an option is put so that it is none. */
+static void put_name(FILE *to, const char *path)
+{
+    const char *name = without_folders(path);
+    size_t room = strlen(name) + 3;
+    char *safe = malloc(room);
+    if (safe) {
+        snprintf(safe, room, "%s%s", *name == '-' ? "./" : "", name);
+        put_word(to, safe);
+    }
+    free(safe);
+}
+
 char *record_make(const char *command, const option *const *options, size_t count, const option_value *before,
                   const arguments *rest)
 {
-    line to = {.used = 0};
-    put(&to, command);
+    char *text = NULL;
+    size_t size;
+    FILE *to = open_memstream(&text, &size);
+    if (!to)
+        return NULL;
+    fputs(command, to);
     for (size_t k = 0; k < count; k++) {
         option_value now = {.integers = {0}};
         memcpy(&now, options[k]->target, record_value_size(options[k]));
         if (record_leaves_out(options[k]->name) || is_default(options[k], &now, &before[k]))
             continue;
-        put(&to, " --");
-        put(&to, options[k]->name);
-        put_value(&to, options[k], &now);
+        fprintf(to, " --%s", options[k]->name);
+        put_value(to, options[k], &now);
     }
-    for (size_t k = 0; k < rest->count; k++) {
-        const char *name = without_folders(rest->names[k]);
-        char path[LIMIT];
-        snprintf(path, sizeof path, "%s%s", *name == '-' ? "./" : "", name); /* or it would be an option */
-        put_word(&to, path);
-    }
-    return to.full ? NULL : strdup(to.text);
+    for (size_t k = 0; k < rest->count; k++)
+        put_name(to, rest->names[k]);
+    bool whole = !ferror(to);
+    if (fclose(to) == 0 && whole)
+        return text;
+    free(text);
+    return NULL;
 }

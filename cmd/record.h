@@ -25,7 +25,7 @@ size_t record_value_size(const option *o);
 bool record_leaves_out(const char *name);
 /* Takes down what the targets hold before parsing. */
 void record_values(const option *const *options, size_t count, option_value *out);
-/* To be freed; NULL when out of memory, or where it would be longer than 4000 bytes. */
+/* To be freed; NULL when out of memory. */
 char *record_make(const char *command, const option *const *options, size_t count, const option_value *before,
                   const arguments *rest);
 

@@ -212,37 +212,52 @@ static bool equal_files(const char *a, const char *b)
     return equal;
 }
 
-/* A failed run leaves nothing: neither the file nor the JSON file beside it. */
-static void remove_output(const char *path)
+/* Where a name's tile begins, as "_x1_y0.r16"; its ending where it has none. */
+static const char *tile_of(const char *path)
 {
-    size_t room = strlen(path) + sizeof ".json";
-    char *beside = malloc(room);
-    unlink(path);
-    if (!beside)
-        return;
-    bool png = command_ends_with(path, ".png");
-    snprintf(beside, room, "%.*s.json", (int)(strlen(path) - (png ? 4 : 0)), path);
-    if (png || command_ends_with(path, ".r16") || command_ends_with(path, ".raw"))
-        unlink(beside);
-    free(beside);
+    const char *dot = strrchr(path, '.'), *at = dot ? dot : path + strlen(path);
+    for (int k = 0; k < 2; k++) {
+        const char *digits = at;
+        while (digits > path && digits[-1] >= '0' && digits[-1] <= '9')
+            digits--;
+        if (digits == at || digits - path < 2 || digits[-1] != (k ? 'x' : 'y') || digits[-2] != '_')
+            return dot ? dot : path + strlen(path);
+        at = digits - 2;
+    }
+    return at;
 }
 
-int same_as_compare(const char *same_as, const common *shared, const arguments *rest)
+/* What is to be equal to `same_as`: the output, or its tile of the same name; to be freed. NULL: none is there. */
+static char *counterpart(const char *same_as, const char *output)
+{
+    const char *dot = strrchr(output, '.'), *tile = tile_of(same_as);
+    size_t stem = dot ? (size_t)(dot - output) : strlen(output), room = stem + strlen(tile) + 1;
+    char *path = is_there(output) ? strdup(output) : malloc(room);
+    if (path && !is_there(output))
+        snprintf(path, room, "%.*s%s", (int)stem, output, tile);
+    if (path && is_there(path))
+        return path;
+    free(path);
+    return NULL;
+}
+
+int same_as_compare(const char *same_as, const common *shared, const arguments *rest, char *const *files, size_t count)
 {
     const tl_format *then = tl_format_of(same_as), *now = tl_format_of(shared->output);
     char *record = then && then == now && rest->record ? read_parameter(same_as, "command") : NULL;
+    char *made = record && strcmp(record, rest->record) == 0 ? counterpart(same_as, shared->output) : NULL;
     int status = EXIT_DONE;
-    if (record && strcmp(record, rest->record) == 0 && is_there(shared->output)) {
-        if (equal_files(same_as, shared->output))
-            command_say(shared, "%s: equal to %s, byte for byte", shared->output, same_as);
-        else {
-            complain("%s: made by the same command as %s, but not equal to it, so not kept: an input or the version of "
-                     "talus is another",
-                     shared->output, same_as);
-            remove_output(shared->output);
-            status = EXIT_FAILED;
-        }
+    if (made && equal_files(same_as, made))
+        command_say(shared, "%s: equal to %s, byte for byte", made, same_as);
+    else if (made) {
+        complain("%s: made by the same command as %s, but not equal to it, so not kept: an input or the version of "
+                 "talus is another",
+                 made, same_as);
+        for (size_t k = 0; k < count; k++) /* a failed run leaves nothing */
+            unlink(files[k]);
+        status = EXIT_FAILED;
     }
+    free(made);
     free(record);
     return status;
 }

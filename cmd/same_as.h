@@ -14,8 +14,9 @@ bool same_as_parse(const command *self, const char *same_as, int argc, const cha
 /* Whether the output is the very file that is to be made again: then told. */
 bool same_as_is_output(const char *same_as, const common *shared);
 
-/* Whether the output is what it was: told; an exit status. One that is not is removed. Only where the record is the
- * same and both are of one format, else nothing is compared. */
-int same_as_compare(const char *same_as, const common *shared, const arguments *rest);
+/* Whether the output is what it was: told; an exit status. Of a preset's tiles, that of the same name. One that is not
+ * goes, with all of `files`, what the run wrote. Only where the record is the same and both are of one format, else
+ * nothing is compared. */
+int same_as_compare(const char *same_as, const common *shared, const arguments *rest, char *const *files, size_t count);
 
 #endif

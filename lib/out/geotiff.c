@@ -32,7 +32,6 @@ enum {
     TILE_BYTES = OUT_TILE * OUT_TILE * (int)sizeof(float),
     GDAL_METADATA = 42112, /* GDAL's private tags */
     GDAL_NODATA = 42113,
-    METADATA_LIMIT = 16384,
 };
 
 /* Above this many bytes of tiles the file is a BigTIFF: a classic one ends at 2^32. */
@@ -77,58 +76,60 @@ static void define_gdal_tags(TIFF *tiff)
     TIFFMergeFieldInfo(tiff, fields, 2);
 }
 
-/* Appends text with XML's special characters replaced. */
-static void append_escaped(char *to, size_t *used, const char *text)
+/* Text with XML's special characters replaced. */
+static void put_escaped(FILE *to, const char *text)
 {
-    for (; *text && *used + 8 < METADATA_LIMIT; text++) {
-        const char *entity = *text == '&'   ? "&amp;"
-                             : *text == '<' ? "&lt;"
-                             : *text == '>' ? "&gt;"
-                             : *text == '"' ? "&quot;"
-                                            : NULL;
-        if (entity) {
-            strcpy(to + *used, entity);
-            *used += strlen(entity);
-        } else
-            to[(*used)++] = *text;
+    for (; *text; text++)
+        switch (*text) {
+        case '&':
+            fputs("&amp;", to);
+            break;
+        case '<':
+            fputs("&lt;", to);
+            break;
+        case '>':
+            fputs("&gt;", to);
+            break;
+        case '"':
+            fputs("&quot;", to);
+            break;
+        default:
+            fputc(*text, to);
+        }
+}
+
+static void put_item(FILE *to, const char *name, const char *value)
+{
+    fprintf(to, "  <Item name=\"talus_%.60s\">", name);
+    put_escaped(to, value);
+    fputs("</Item>\n", to);
+}
+
+static void put_metadata(FILE *to, const tl_source_info *info, const out_packing *packing)
+{
+    fputs("<GDALMetadata>\n", to);
+    for (size_t i = 0; i < info->parameter_count; i++)
+        put_item(to, info->parameters[i].name, info->parameters[i].value);
+    if (info->contents)
+        put_item(to, "contents", info->contents);
+    if (packing->lerc_error > 0) {
+        char number[TL_NUMBER_TEXT];
+        tl_number_text(packing->lerc_error, number);
+        put_item(to, "lerc_error", number);
     }
-    to[*used] = '\0';
-}
-
-static void append(char *to, size_t *used, const char *format, const char *text)
-{
-    size_t more = (size_t)snprintf(to + *used, METADATA_LIMIT - *used, format, text);
-    *used = *used + more < METADATA_LIMIT ? *used + more : METADATA_LIMIT - 1;
-}
-
-/* Leaves an item out that does not fit. */
-static void append_item(char *to, size_t *used, const char *name, const char *value)
-{
-    size_t before = *used;
-    append(to, used, "  <Item name=\"talus_%.60s\">", name);
-    append_escaped(to, used, value);
-    append(to, used, "%s", "</Item>\n");
-    if (*used + sizeof "</GDALMetadata>\n" > METADATA_LIMIT)
-        to[ *used = before] = '\0';
+    fputs("</GDALMetadata>\n", to);
 }
 
 static bool set_metadata(TIFF *tiff, const tl_source_info *info, const out_packing *packing)
 {
-    char *text = malloc(METADATA_LIMIT);
-    if (!text)
+    char *text = NULL;
+    size_t size;
+    FILE *to = open_memstream(&text, &size);
+    if (!to)
         return false;
-    size_t used = (size_t)snprintf(text, METADATA_LIMIT, "<GDALMetadata>\n");
-    for (size_t i = 0; i < info->parameter_count && used + 1024 < METADATA_LIMIT; i++)
-        append_item(text, &used, info->parameters[i].name, info->parameters[i].value);
-    if (info->contents)
-        append_item(text, &used, "contents", info->contents);
-    if (packing->lerc_error > 0) {
-        char number[TL_NUMBER_TEXT];
-        tl_number_text(packing->lerc_error, number);
-        append_item(text, &used, "lerc_error", number);
-    }
-    snprintf(text + used, METADATA_LIMIT - used, "</GDALMetadata>\n");
-    bool good = TIFFSetField(tiff, GDAL_METADATA, text) == 1;
+    put_metadata(to, info, packing);
+    bool good = !ferror(to);
+    good = fclose(to) == 0 && good && TIFFSetField(tiff, GDAL_METADATA, text) == 1;
     free(text);
     return good;
 }
