@@ -2,6 +2,7 @@
 #define _GNU_SOURCE /* mkdtemp */
 #include "lib/base/size.h"
 #include "lib/scene/layers.h"
+#include "lib/scene/north_up.h"
 
 #include <math.h>
 #include <setjmp.h>
@@ -273,6 +274,62 @@ static void sigmaIsThatOfTheField(void **state)
     tl_source_destroy(source);
 }
 
+/* A map that says the same everywhere gives what the one exponent gives; of others, fBm's rule holds place by place. */
+static void sigmaFollowsTheMapOfExponents(void **state)
+{
+    (void)state;
+    static float heights[WIDTH * HEIGHT], exponents[WIDTH * HEIGHT];
+    tl_source *source = make(waves, 1, heights), *map = make(waves, 1, exponents);
+    for (int ramp = 0; ramp < 2; ramp++) {
+        for (int k = 0; k < WIDTH * HEIGHT; k++)
+            exponents[k] = ramp ? 0.2f + 0.6f * (float)(k % WIDTH) / (WIDTH - 1) : 0.25f;
+        tl_field_options options = {
+            .levels = 3, .hurst_map = map, .delta_given = true, .delta = 4, .support = TL_SUPPORT_POINT};
+        tl_source *field = tl_field_create(source, &options, NULL);
+        assert_non_null(field);
+        float *sigma = read_layer(field, "sigma", NULL, (tl_window){10, 5, 40, 30});
+        for (int k = 0; k < 40 * 30; k++) {
+            double hurst = ramp ? 0.2 + 0.6 * (10 + k % 40) / 8.0 / (WIDTH - 1) : 0.25;
+            assert_near((double)sigma[k], 4 * pow(0.125, hurst), 1e-5);
+        }
+        free(sigma);
+        tl_source_destroy(field);
+    }
+    tl_source_destroy(map);
+    tl_source_destroy(source);
+}
+
+/* Whatever way rows and columns are stored, a layer's upright samples are those of the heights turned first. */
+static void turnedLayersAreThoseOfTurnedHeights(void **state)
+{
+    (void)state;
+    static const char *const names[] = {"normal", "tangent", "slope", "curvature", "colour", "splat", "mask"};
+    static float heights[WIDTH * HEIGHT];
+    tl_source *source = make(waves, 1, heights);
+    heights[700] = NAN;
+    for (int turns = 0; turns < 4; turns++) {
+        double *t = source->info.georef.transform;
+        t[1] = turns & 1 ? -fabs(t[1]) : fabs(t[1]);
+        t[5] = turns & 2 ? fabs(t[5]) : -fabs(t[5]);
+        tl_source *upright = scene_north_up(source, NULL);
+        for (size_t n = 0; n < sizeof names / sizeof *names; n++) {
+            const tl_window part = {3, 4, 50, 20};
+            scene_layer *layer = scene_layer_create(source, names[n], NULL, NULL);
+            size_t channels = scene_layer_kind(layer)->channels, count = channels * 50 * 20;
+            float *wanted = read_layer(upright, names[n], NULL, part), *found = malloc(count * sizeof *found);
+            assert_int_equal(scene_layer_read_upright(layer, part, found, NULL), TL_OK);
+            for (size_t k = 0; k < count; k++)
+                if (!isnan(wanted[k]) || !isnan(found[k]))
+                    assert_near((double)found[k], (double)wanted[k], 1e-6); /* of some, rows are summed backwards */
+            free(found);
+            free(wanted);
+            scene_layer_destroy(layer);
+        }
+        tl_source_destroy(upright);
+    }
+    tl_source_destroy(source);
+}
+
 int main(void)
 {
     const struct CMUnitTest tests[] = {
@@ -283,6 +340,8 @@ int main(void)
         cmocka_unit_test(rulesShareTheGround),
         cmocka_unit_test(wrongRulesAreTold),
         cmocka_unit_test(sigmaIsThatOfTheField),
+        cmocka_unit_test(sigmaFollowsTheMapOfExponents),
+        cmocka_unit_test(turnedLayersAreThoseOfTurnedHeights),
         cmocka_unit_test(hurstIsThatOfTheMap),
         cmocka_unit_test(masksTellWhatIsKnown),
     };

@@ -133,7 +133,7 @@ static tl_status paint_rows(void *context, int64_t y, int64_t count, unsigned ch
     size_t samples = (size_t)(count * self->width);
     float *values = tl_alloc(self->kind->channels * samples, sizeof *values);
     tl_status status = !values       ? tl_fail_memory(error, "a layer's rows")
-                       : self->layer ? scene_layer_read(self->layer, window, values, error)
+                       : self->layer ? scene_layer_read_upright(self->layer, window, values, error)
                                      : tl_source_read(self->channel, self->channel->info.level, window, values, error);
     for (size_t k = 0; status == TL_OK && k < samples; k++)
         out_layer_paint(self->kind, values + k, samples, rgba + 4 * k);
@@ -166,7 +166,7 @@ static tl_status write_png(const tl_source *heights, const scene_layer *layer, t
 
 static tl_status read_planes(void *context, tl_window window, float *out, tl_error *error)
 {
-    return scene_layer_read(context, window, out, error);
+    return scene_layer_read_upright(context, window, out, error);
 }
 
 static tl_status write_exr(const tl_source *heights, scene_layer *layer, tl_output *output,
@@ -197,8 +197,9 @@ static bool ends_with(const char *path, const char *ending)
     return dot && strcasecmp(dot + 1, ending) == 0;
 }
 
-/* One file of several channels, or a picture. */
-static tl_status write_channels(const tl_source *heights, const char *kind, const char *path,
+/* One file of several channels, or a picture. `upright` has the north on top; the layer is made of `heights`, which may
+ * be a field, as it then would not be any more, and turned. */
+static tl_status write_channels(const tl_source *heights, const tl_source *upright, const char *kind, const char *path,
                                 const tl_layer_options *options, tl_error *error)
 {
     scene_layer *layer = scene_layer_create(heights, kind, options, error);
@@ -207,8 +208,8 @@ static tl_status write_channels(const tl_source *heights, const char *kind, cons
     tl_write_options writing = {
         .overwrite = options->overwrite, .compression = options->compression, .run = options->run};
     if (status == TL_OK)
-        status = ends_with(path, "png") ? write_png(heights, layer, output, options->run, error)
-                                        : write_exr(heights, layer, output, &writing, error);
+        status = ends_with(path, "png") ? write_png(upright, layer, output, options->run, error)
+                                        : write_exr(upright, layer, output, &writing, error);
     if (status == TL_OK)
         status = tl_output_commit(output, error);
     else
@@ -226,12 +227,6 @@ static tl_status write_scalar(const tl_source *heights, const char *kind, const 
     tl_status status = layer ? tl_write_grid(layer, path, &writing, error) : TL_ERROR_ARGUMENT;
     tl_source_destroy(layer);
     return status;
-}
-
-/* Whether its rows and columns run as a picture's, or are turned so that nothing helps. */
-static bool is_upright(const double *t)
-{
-    return t[2] != 0 || t[4] != 0 || (t[1] > 0 && t[5] < 0);
 }
 
 /* Of one channel, as a picture: the layer is turned, and not the heights, which then would not be the field any more.
@@ -270,10 +265,8 @@ tl_status tl_write_layer(const tl_source *heights, const char *kind, const char 
         return write_scalar(heights, kind, path, options, error);
     if (found && found->channels == 1)
         return write_grey(heights, kind, path, options, error);
-    if (is_upright(heights->info.georef.transform))
-        return write_channels(heights, kind, path, options, error);
     tl_source *upright = scene_north_up(heights, error);
-    tl_status status = upright ? write_channels(upright, kind, path, options, error) : TL_ERROR_MEMORY;
+    tl_status status = upright ? write_channels(heights, upright, kind, path, options, error) : TL_ERROR_MEMORY;
     tl_source_destroy(upright);
     return status;
 }
@@ -298,7 +291,7 @@ static tl_status read_collection(void *context, tl_window window, float *out, tl
     tl_status status = tl_source_read(c->heights, c->heights->info.level, window, out, error);
     for (size_t k = 0; k < c->count && status == TL_OK; k++) {
         out += samples * (k ? scene_layer_kind(c->layers[k - 1])->channels : 1);
-        status = scene_layer_read(c->layers[k], window, out, error);
+        status = scene_layer_read_upright(c->layers[k], window, out, error);
     }
     return status;
 }
@@ -382,11 +375,8 @@ tl_status tl_write_layers(const tl_source *heights, const tl_source *surface, co
     surface = surface ? surface : heights;
     if (!ends_with(path, "exr"))
         return tl_fail(error, TL_ERROR_ARGUMENT, "%s: only an .exr holds heights and layers in one file", path);
-    if (is_upright(heights->info.georef.transform))
-        return collect(heights, surface, kinds, count, path, options, error);
-    tl_source *turned = scene_north_up(heights, error), *below = turned ? scene_north_up(surface, error) : NULL;
-    tl_status status = below ? collect(turned, below, kinds, count, path, options, error) : TL_ERROR_MEMORY;
-    tl_source_destroy(below);
-    tl_source_destroy(turned);
+    tl_source *upright = scene_north_up(heights, error);
+    tl_status status = upright ? collect(upright, surface, kinds, count, path, options, error) : TL_ERROR_MEMORY;
+    tl_source_destroy(upright);
     return status;
 }

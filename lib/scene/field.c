@@ -590,6 +590,11 @@ void scene_field_fractal(const tl_source *source, int level, double *delta, doub
     *hurst = f->hursts[level];
 }
 
+bool scene_field_has_exponents(const tl_source *source)
+{
+    return as_field(source)->chain.placed;
+}
+
 /* One of the planes at the model's samples; `otherwise` everywhere where the chain has none. */
 static tl_status read_plane(const field *f, int plane, bool is_there, float otherwise, tl_window window, float *out,
                             tl_error *error)

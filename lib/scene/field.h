@@ -15,6 +15,8 @@ bool scene_field_nests(const tl_source *source);
 void scene_field_fractal(const tl_source *source, int level, double *delta, double *hurst);
 /* Factors on it at the model's samples; a window that may reach beyond the model. */
 tl_status scene_field_strengths(const tl_source *source, tl_window window, float *out, tl_error *error);
+/* Whether exponents vary from place to place: the strengths are then delta over a sample of the model. */
+bool scene_field_has_exponents(const tl_source *source);
 /* Exponents of the finest level at the model's samples; a window that may reach beyond the model. */
 tl_status scene_field_hursts(const tl_source *source, tl_window window, float *out, tl_error *error);
 /* The window of the model that a window of `level` is made from. */

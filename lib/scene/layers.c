@@ -1,11 +1,13 @@
 #include "lib/scene/layers.h"
 
+#include "fbm/elementary.h"
 #include "lib/base/error.h"
 #include "lib/base/georef.h"
 #include "lib/base/size.h"
 #include "lib/scene/field.h"
 #include "lib/scene/layer_rules.h"
 #include "lib/scene/light.h"
+#include "lib/scene/north_up.h"
 #include "lib/scene/render.h"
 
 #include <math.h>
@@ -31,7 +33,8 @@ struct scene_layer {
     const tl_source *heights;
     bool needs_sigma, needs_hurst;
     double axes[2][2]; /* unit vectors of columns and of rows in the CRS's plane, east and north */
-    double sigma;      /* of the whole field, metres over one sample */
+    double sigma;      /* metres over one sample of the finest level where the strength is 1 or, */
+    bool has_places;   /* where exponents vary, over one of the model */
     scene_light light;
     scene_palette palette;
     layer_rules rules;
@@ -176,9 +179,10 @@ static void cell_of_row(const tl_source_info *info, int64_t row, double *x, doub
 /* Heights of a window with one sample more on all sides, in metres; NaN where there is none. */
 struct patch {
     tl_window window;
-    float *heights, *strengths; /* strengths: of the model's samples around; NULL: 1 everywhere */
-    tl_window model;            /* their window */
-    int level, cells;           /* cells: 1 where samples stand for them */
+    float *heights;
+    float *strengths, *exponents; /* of the model's samples around; NULL: not asked for, or 1 everywhere */
+    tl_window model;              /* their window */
+    int level, cells;             /* cells: 1 where samples stand for them */
 };
 
 static inline double height_at(const patch *p, int64_t x, int64_t y)
@@ -200,17 +204,25 @@ static double curvature_of(double p, double q, double r, double s, double t)
     return ((1 + q * q) * r - 2 * p * q * s + (1 + p * p) * t) / (2 * w * sqrt(w));
 }
 
-static double strength_at(const patch *p, int64_t x, int64_t y)
+/* What is known at the model's samples, between them. */
+static double between(const patch *p, const float *values, int64_t x, int64_t y)
 {
-    if (!p->strengths)
+    if (!values)
         return 1;
     double scale = ldexp(1, -p->level), shift = 0.5 * p->cells * (1 - scale); /* cells' middles */
     double u = (double)(p->window.x + x) * scale - shift, v = (double)(p->window.y + y) * scale - shift;
     int64_t i0 = (int64_t)floor(u), j0 = (int64_t)floor(v);
-    const float *at = p->strengths + (j0 - p->model.y) * p->model.width + i0 - p->model.x;
+    const float *at = values + (j0 - p->model.y) * p->model.width + i0 - p->model.x;
     double a = u - (double)i0, b = v - (double)j0;
     return (1 - b) * ((1 - a) * (double)at[0] + a * (double)at[1]) +
            b * ((1 - a) * (double)at[p->model.width] + a * (double)at[p->model.width + 1]);
+}
+
+/* fBm's rule, where exponents vary: delta over 2^-level samples of the model. */
+static double sigma_at(const scene_layer *layer, const patch *p, int64_t x, int64_t y)
+{
+    double sigma = layer->sigma * between(p, p->strengths, x, y);
+    return layer->has_places ? sigma * fbm_exp2(-p->level * between(p, p->exponents, x, y)) : sigma;
 }
 
 static spot spot_at(const scene_layer *layer, const patch *p, int64_t x, int64_t y, double dx, double dy)
@@ -222,8 +234,8 @@ static spot spot_at(const scene_layer *layer, const patch *p, int64_t x, int64_t
     spot at = {.z = z / layer->heights->info.georef.height_unit,
                .east = scene_slope(west, z, east, dx),
                .north = scene_slope(down, z, up, dy),
-               .sigma = layer->needs_sigma ? layer->sigma * strength_at(p, x, y) : (double)NAN,
-               .hurst = layer->needs_hurst ? strength_at(p, x, y) : (double)NAN};
+               .sigma = layer->needs_sigma ? sigma_at(layer, p, x, y) : (double)NAN,
+               .hurst = layer->needs_hurst ? between(p, p->exponents, x, y) : (double)NAN};
     at.curvature = curvature_of(at.east, at.north, bend_of(west, z, east, dx), isnan(cross) ? 0 : cross / (4 * dx * dy),
                                 bend_of(up, z, down, dy));
     return at;
@@ -241,10 +253,14 @@ static tl_status read_strengths(const scene_layer *layer, patch *p, tl_error *er
     m->x = (w.x >> p->level) - p->cells, m->y = (w.y >> p->level) - p->cells;
     m->width = ((w.x + w.width - 1) >> p->level) + 2 - m->x;
     m->height = ((w.y + w.height - 1) >> p->level) + 2 - m->y;
+    const tl_source *field = layer->heights;
+    bool exponents = layer->needs_hurst || layer->has_places;
     p->strengths = tl_alloc_grid(m->width, m->height, sizeof *p->strengths);
-    if (!p->strengths)
-        return tl_fail_memory(error, layer->heights->info.name);
-    return (layer->needs_hurst ? scene_field_hursts : scene_field_strengths)(layer->heights, *m, p->strengths, error);
+    p->exponents = exponents ? tl_alloc_grid(m->width, m->height, sizeof *p->exponents) : NULL;
+    if (!p->strengths || (exponents && !p->exponents))
+        return tl_fail_memory(error, field->info.name);
+    tl_status status = layer->needs_sigma ? scene_field_strengths(field, *m, p->strengths, error) : TL_OK;
+    return status == TL_OK && exponents ? scene_field_hursts(field, *m, p->exponents, error) : status;
 }
 
 static tl_status read_heights(const scene_layer *layer, patch *p, tl_error *error)
@@ -305,6 +321,25 @@ tl_status scene_layer_read(const scene_layer *layer, tl_window window, float *ou
     }
     free(p.heights);
     free(p.strengths);
+    free(p.exponents);
+    return status;
+}
+
+tl_status scene_layer_read_upright(const scene_layer *layer, tl_window window, float *out, tl_error *error)
+{
+    const tl_source_info *info = &layer->heights->info;
+    size_t samples = (size_t)(window.width * window.height);
+    bool columns, rows;
+    scene_north_up_turns(&info->georef, &columns, &rows);
+    tl_window theirs = scene_turned_window(window, info->width, info->height, columns, rows);
+    tl_status status = scene_layer_read(layer, theirs, out, error);
+    for (size_t c = 0; status == TL_OK && c < layer->kind->channels; c++) {
+        float *channel = out + c * samples;
+        scene_turn(channel, window, columns, rows);
+        bool turned = c == 0 ? columns : c == 1 && rows; /* what points to the right, and up, points back */
+        for (size_t k = 0; k < samples && turned && layer->make == make_tangent; k++)
+            channel[k] = -channel[k];
+    }
     return status;
 }
 
@@ -348,7 +383,8 @@ static tl_status find_sigma(scene_layer *layer, tl_error *error)
                        "points (--support point)",
                        s->info.name);
     double hurst;
-    scene_field_fractal(s, s->info.level, &layer->sigma, &hurst);
+    layer->has_places = scene_field_has_exponents(s);
+    scene_field_fractal(s, layer->has_places ? 0 : s->info.level, &layer->sigma, &hurst);
     layer->sigma *= s->info.georef.height_unit;
     return TL_OK;
 }

@@ -23,6 +23,9 @@ const tl_layer_kind *scene_layer_kind(const scene_layer *layer);
 /* The window's values, channel by channel; NaN where the height is void. Any number of threads. */
 tl_status scene_layer_read(const scene_layer *layer, tl_window window, float *out, tl_error *error);
 
+/* The same of the raster with the north on top and the west on the left: see scene_north_up. */
+tl_status scene_layer_read_upright(const scene_layer *layer, tl_window window, float *out, tl_error *error);
+
 /* Slope by both neighbours, `step` away, by the one that is there, or level. */
 static inline double scene_slope(double before, double here, double behind, double step)
 {

@@ -27,6 +27,31 @@ static void swap_rows(float *a, float *b, int64_t width)
     }
 }
 
+void scene_north_up_turns(const tl_georef *georef, bool *columns, bool *rows)
+{
+    const double *t = georef->transform;
+    bool upright = t[2] == 0 && t[4] == 0;
+    *columns = upright && t[1] < 0;
+    *rows = upright && t[5] > 0;
+}
+
+tl_window scene_turned_window(tl_window window, int64_t width, int64_t height, bool columns, bool rows)
+{
+    if (columns)
+        window.x = width - window.x - window.width;
+    if (rows)
+        window.y = height - window.y - window.height;
+    return window;
+}
+
+void scene_turn(float *samples, tl_window window, bool columns, bool rows)
+{
+    for (int64_t y = 0; columns && y < window.height; y++)
+        reverse(samples + y * window.width, window.width);
+    for (int64_t y = 0; rows && y < window.height / 2; y++)
+        swap_rows(samples + y * window.width, samples + (window.height - 1 - y) * window.width, window.width);
+}
+
 /* Where a window lies in the original. */
 static tl_status window_of_original(const north_up *n, int level, tl_window window, tl_window *out, tl_error *error)
 {
@@ -34,11 +59,7 @@ static tl_status window_of_original(const north_up *n, int level, tl_window wind
     tl_status status = tl_source_size(n->original, level, &width, &height, error);
     if (status != TL_OK)
         return status;
-    *out = window;
-    if (n->columns)
-        out->x = width - window.x - window.width;
-    if (n->rows)
-        out->y = height - window.y - window.height;
+    *out = scene_turned_window(window, width, height, n->columns, n->rows);
     return TL_OK;
 }
 
@@ -49,13 +70,9 @@ static tl_status north_up_read(const tl_source *self, int level, tl_window windo
     tl_status status = window_of_original(n, level, window, &theirs, error);
     if (status == TL_OK)
         status = tl_source_read(n->original, level, theirs, out, error);
-    if (status != TL_OK)
-        return status;
-    for (int64_t y = 0; n->columns && y < window.height; y++)
-        reverse(out + y * window.width, window.width);
-    for (int64_t y = 0; n->rows && y < window.height / 2; y++)
-        swap_rows(out + y * window.width, out + (window.height - 1 - y) * window.width, window.width);
-    return TL_OK;
+    if (status == TL_OK)
+        scene_turn(out, window, n->columns, n->rows);
+    return status;
 }
 
 static tl_status north_up_validity(const tl_source *self, int level, tl_window window, unsigned char *out,
@@ -117,9 +134,7 @@ tl_source *scene_north_up(const tl_source *source, tl_error *error)
                             .destroy = north_up_destroy};
     n->original = source;
     double *t = n->source.info.georef.transform;
-    bool upright = t[2] == 0 && t[4] == 0;
-    n->columns = upright && t[1] < 0;
-    n->rows = upright && t[5] > 0;
+    scene_north_up_turns(&source->info.georef, &n->columns, &n->rows);
     if (n->columns || n->rows)
         n->source.info.block_width = n->source.info.block_height = 0; /* they do not begin at this corner */
     if (n->columns) {
