@@ -76,60 +76,56 @@ static void define_gdal_tags(TIFF *tiff)
     TIFFMergeFieldInfo(tiff, fields, 2);
 }
 
-/* Text with XML's special characters replaced. */
-static void put_escaped(FILE *to, const char *text)
+/* Appends text with XML's special characters replaced: at most six bytes each. */
+static char *append_escaped(char *to, const char *text)
 {
-    for (; *text; text++)
-        switch (*text) {
-        case '&':
-            fputs("&amp;", to);
-            break;
-        case '<':
-            fputs("&lt;", to);
-            break;
-        case '>':
-            fputs("&gt;", to);
-            break;
-        case '"':
-            fputs("&quot;", to);
-            break;
-        default:
-            fputc(*text, to);
-        }
-}
-
-static void put_item(FILE *to, const char *name, const char *value)
-{
-    fprintf(to, "  <Item name=\"talus_%.60s\">", name);
-    put_escaped(to, value);
-    fputs("</Item>\n", to);
-}
-
-static void put_metadata(FILE *to, const tl_source_info *info, const out_packing *packing)
-{
-    fputs("<GDALMetadata>\n", to);
-    for (size_t i = 0; i < info->parameter_count; i++)
-        put_item(to, info->parameters[i].name, info->parameters[i].value);
-    if (info->contents)
-        put_item(to, "contents", info->contents);
-    if (packing->lerc_error > 0) {
-        char number[TL_NUMBER_TEXT];
-        tl_number_text(packing->lerc_error, number);
-        put_item(to, "lerc_error", number);
+    for (; *text; text++) {
+        const char *entity = *text == '&'   ? "&amp;"
+                             : *text == '<' ? "&lt;"
+                             : *text == '>' ? "&gt;"
+                             : *text == '"' ? "&quot;"
+                                            : NULL;
+        if (entity)
+            to = stpcpy(to, entity);
+        else
+            *to++ = *text;
     }
-    fputs("</GDALMetadata>\n", to);
+    *to = '\0';
+    return to;
+}
+
+enum { ITEM_ROOM = 128 }; /* bytes of an item beside its value, whose name is cut at 60 */
+
+static char *append_item(char *to, const char *name, const char *value)
+{
+    to += snprintf(to, ITEM_ROOM, "  <Item name=\"talus_%.60s\">", name);
+    return stpcpy(append_escaped(to, value), "</Item>\n");
+}
+
+static char *metadata_of(const tl_source_info *info, double lerc_error)
+{
+    size_t room = 3 * ITEM_ROOM + 6 * (info->contents ? strlen(info->contents) : 0);
+    for (size_t i = 0; i < info->parameter_count; i++)
+        room += ITEM_ROOM + 6 * strlen(info->parameters[i].value);
+    char *text = malloc(room), *to = text, number[TL_NUMBER_TEXT];
+    if (!text)
+        return NULL;
+    to = stpcpy(to, "<GDALMetadata>\n");
+    for (size_t i = 0; i < info->parameter_count; i++)
+        to = append_item(to, info->parameters[i].name, info->parameters[i].value);
+    if (info->contents)
+        to = append_item(to, "contents", info->contents);
+    tl_number_text(lerc_error, number);
+    if (lerc_error > 0)
+        to = append_item(to, "lerc_error", number);
+    stpcpy(to, "</GDALMetadata>\n");
+    return text;
 }
 
 static bool set_metadata(TIFF *tiff, const tl_source_info *info, const out_packing *packing)
 {
-    char *text = NULL;
-    size_t size;
-    FILE *to = open_memstream(&text, &size);
-    if (!to)
-        return false;
-    put_metadata(to, info, packing);
-    bool good = !ferror(to);
-    good = fclose(to) == 0 && good && TIFFSetField(tiff, GDAL_METADATA, text) == 1;
+    char *text = metadata_of(info, packing->lerc_error);
+    bool good = text && TIFFSetField(tiff, GDAL_METADATA, text) == 1;
     free(text);
     return good;
 }
