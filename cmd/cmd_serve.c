@@ -40,6 +40,7 @@ static const struct {
              {".css", "text/css; charset=utf-8", false},
              {".wasm", "application/wasm", false},
              {".glb", "model/gltf-binary", false},
+             {".subtree", "application/octet-stream", false},
              {".png", "image/png", false},
              {".jpg", "image/jpeg", false},
              {".svg", "image/svg+xml", false},
@@ -128,7 +129,7 @@ static const char no_page[] =
     "<!doctype html><html lang=\"en\"><meta charset=\"utf-8\"><title>talus</title>"
     "<p>This folder has no page of its own. <code>examples/viewer/build.sh</code> makes one that shows terrain; "
     "<code>talus serve FOLDER --viewer examples/viewer/dist</code> serves it with the folder."
-    "<p><a href=\"layer.json\">layer.json</a></html>";
+    "<p><a href=\"layer.json\">layer.json</a>, <a href=\"tileset.json\">tileset.json</a></html>";
 
 static enum MHD_Result answer(void *user, struct MHD_Connection *connection, const char *url, const char *method,
                               const char *version, const char *upload, size_t *upload_size, void **state)

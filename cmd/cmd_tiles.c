@@ -14,7 +14,7 @@ typedef struct settings {
     int format, coding;
     double max_error;
     int64_t extra, seed;
-    const char *levels, *shard, *attribution;
+    const char *levels, *shard, *attribution, *layers;
     bool no_normals, resume, finish, dry_run;
     double outside;
     tl_field_options field;
@@ -159,9 +159,9 @@ static bool output_ok(const settings *set)
 
 static bool format_ok(const settings *set)
 {
-    if (set->format == TL_TILES_3D || set->coding == CODING_QUANTIZED)
+    if (set->format == TL_TILES_3D || (set->coding == CODING_QUANTIZED && !set->layers))
         return true;
-    complain("--coding is for --format 3dtiles");
+    complain("%s is for --format 3dtiles", set->layers ? "--layers" : "--coding");
     return false;
 }
 
@@ -184,6 +184,9 @@ static int run_tiles(const command *self, int argc, const char **argv, bool help
         {"coding", 0, OPTION_CHOICE, &set.coding, NULL, "CODING",
          "of 3dtiles: quantized (default), or compressed by EXT_meshopt_compression, for readers that know it", 0, 0,
          codings},
+        {"layers", 0, OPTION_TEXT, &set.layers, NULL, "KINDS",
+         "of 3dtiles: pictures on the tiles, colour (by height, without light), normal or both, with a comma", 0, 0,
+         NULL},
         {"no-normals", 0, OPTION_FLAG, &set.no_normals, NULL, NULL, "leave the vertices' normals away", 0, 0, NULL},
         {"outside", 0, OPTION_NUMBER, &set.outside, NULL, "METRES",
          "height of ground that the DEM does not know (default: 0)", -1e5, 1e5, NULL},
@@ -220,8 +223,9 @@ static int run_tiles(const command *self, int argc, const char **argv, bool help
                                 .resume = set.resume,
                                 .finish = set.finish,
                                 .dry_run = set.dry_run};
-    bool good =
-        output_ok(&set) && format_ok(&set) && read_levels(set.levels, &options) && read_shard(set.shard, &options);
+    bool good = output_ok(&set) && format_ok(&set) && read_levels(set.levels, &options) &&
+                read_shard(set.shard, &options) &&
+                (!set.layers || command_texture_names(set.layers, &options.textures));
     status = good ? make_tiles(&set, &rest, &options) : EXIT_USAGE;
     arguments_free(&rest);
     return status;

@@ -250,17 +250,11 @@ bool command_ends_with(const char *path, const char *ending)
     return length > end && strcasecmp(path + length - end, ending) == 0;
 }
 
-bool command_textures(const common *options, unsigned *out)
+bool command_texture_names(const char *text, unsigned *out)
 {
     static const char *const names[] = {"colour", "normal"}; /* by tl_texture's bits */
-    const char *at = options->textures;
+    const char *at = text;
     *out = 0;
-    if (!at && !options->texture_size)
-        return true;
-    if (!at || !command_ends_with(options->output, ".glb")) {
-        complain(at ? "--texture is for .glb; other formats have none" : "--texture-size is for --texture KINDS");
-        return false;
-    }
     for (size_t length; at; at = at[length] ? at + length + 1 : NULL) {
         length = strcspn(at, ",");
         int k = 0;
@@ -275,6 +269,19 @@ bool command_textures(const common *options, unsigned *out)
         *out |= 1u << k;
     }
     return true;
+}
+
+bool command_textures(const common *options, unsigned *out)
+{
+    const char *at = options->textures;
+    *out = 0;
+    if (!at && !options->texture_size)
+        return true;
+    if (!at || !command_ends_with(options->output, ".glb")) {
+        complain(at ? "--texture is for .glb; other formats have none" : "--texture-size is for --texture KINDS");
+        return false;
+    }
+    return command_texture_names(at, out);
 }
 
 bool command_split_ok(const common *options)

@@ -238,6 +238,8 @@ bool command_split_ok(const common *options);
 /* The tl_texture values of the option --texture, added; told and false where it names others or the output is no .glb.
  */
 bool command_textures(const common *options, unsigned *out);
+/* The same of a list of names. */
+bool command_texture_names(const char *names, unsigned *out);
 bool command_ends_with(const char *path, const char *ending);
 
 /* Whether an output was named and has an ending that talus writes as `grid` or `mesh`; else told. */

@@ -179,33 +179,38 @@ static void spread(unsigned char *row, int64_t width)
     }
 }
 
+tl_status out_texture_pixels(const scene_layer *layer, tl_window window, unsigned char *rgba, tl_error *error)
+{
+    const tl_layer_kind *kind = scene_layer_kind(layer);
+    const bool normals = strcmp(kind->name, "tangent") == 0;
+    size_t samples = (size_t)(window.width * window.height);
+    float *values = tl_alloc(kind->channels * samples, sizeof *values);
+    tl_status status = values ? scene_layer_read(layer, window, values, error) : tl_fail_memory(error, "a texture");
+    scene_encode_prepare();
+    for (size_t k = 0; status == TL_OK && k < samples; k++)
+        out_layer_paint(kind, values + k, samples, rgba + 4 * k);
+    for (int64_t y = 0; status == TL_OK && y < window.height; y++)
+        spread(rgba + y * window.width * 4, window.width);
+    for (size_t k = 0; status == TL_OK && k < samples; k++)
+        if (!rgba[4 * k + 3]) /* a row without any height */
+            memcpy(rgba + 4 * k, normals ? "\x80\x80\xff\xff" : "\x80\x80\x80\xff", 4);
+    free(values);
+    return status;
+}
+
 static tl_status paint_band(void *context, tl_parallel *loop, uint64_t band, unsigned worker, tl_error *error)
 {
     const painting *p = context;
-    const tl_layer_kind *kind = scene_layer_kind(p->layer);
-    tl_window window = {0, (int64_t)band * ROWS, p->width, tl_int64_min(ROWS, p->height - (int64_t)band * ROWS)};
-    size_t samples = (size_t)(window.width * window.height);
-    float *values = tl_alloc(kind->channels * samples, sizeof *values);
-    tl_status status = values ? scene_layer_read(p->layer, window, values, error) : tl_fail_memory(error, "a texture");
-    unsigned char *to = p->rgba + window.y * p->width * 4;
+    const tl_window window = {0, (int64_t)band * ROWS, p->width, tl_int64_min(ROWS, p->height - (int64_t)band * ROWS)};
     (void)loop;
     (void)worker;
-    for (size_t k = 0; status == TL_OK && k < samples; k++)
-        out_layer_paint(kind, values + k, samples, to + 4 * k);
-    for (int64_t y = 0; status == TL_OK && y < window.height; y++)
-        spread(to + y * p->width * 4, p->width);
-    free(values);
-    return status;
+    return out_texture_pixels(p->layer, window, p->rgba + window.y * p->width * 4, error);
 }
 
 static tl_status write_png(const painting *p, tl_output *output, const tl_run *run, uint64_t *bytes, tl_error *error)
 {
     const scene_picture picture = {.width = p->width, .height = p->height, .rgba = p->rgba};
     struct stat written;
-    const bool normals = strcmp(scene_layer_kind(p->layer)->name, "tangent") == 0;
-    for (int64_t k = 0; k < p->width * p->height; k++)
-        if (!p->rgba[4 * k + 3]) /* a row without any height */
-            memcpy(p->rgba + 4 * k, normals ? "\x80\x80\xff\xff" : "\x80\x80\x80\xff", 4);
     tl_status status = out_picture_write(&picture, output, run, error);
     if (status == TL_OK)
         status = tl_output_flush(output, error);

@@ -3,6 +3,7 @@
 #define OUT_TEXTURE_H
 
 #include "lib/base/output.h"
+#include "lib/scene/layers.h"
 #include "lib/talus.h"
 
 enum { OUT_TEXTURE_SIZE = 4096 }; /* texels on a side, at most, unless told otherwise */
@@ -25,5 +26,8 @@ void out_texture_place(const out_texture *texture, double i, double j, float uv[
  * take what is beside them. */
 tl_output *out_texture_paint(const out_texture *texture, const char *layer, const char *path, const tl_run *run,
                              uint64_t *bytes, tl_error *error);
+/* A window of a layer in 8 bits, rows without gaps. Voids take what is beside them in their row; a row without any
+ * height is grey, or level. */
+tl_status out_texture_pixels(const scene_layer *layer, tl_window window, unsigned char *rgba, tl_error *error);
 
 #endif

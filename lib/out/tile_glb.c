@@ -14,6 +14,7 @@
 #include <string.h>
 
 enum { STEPS = 65535, GLB_MAGIC = 0x46546c67, CHUNK_JSON = 0x4e4f534a, CHUNK_BINARY = 0x004e4942, VIEWS = 8 };
+enum { POSITIONS, NORMALS, TANGENTS, PLACES, INDICES, PARTS }; /* places: of texels */
 enum {
     ARRAY_BUFFER = 34962,
     ELEMENT_ARRAY_BUFFER = 34963,
@@ -28,7 +29,7 @@ enum {
 /* A vertex in the file: two parts, as readers may want the positions alone. */
 typedef struct packed {
     uint16_t position[3], none;
-    int8_t normal[4];
+    int8_t normal[4], tangent[4];
     uint16_t uv[2];
 } packed;
 
@@ -45,7 +46,7 @@ struct out_glb_encoder {
     out_glb_style style;
     packed *vertices;
     uint32_t *indices;
-    unsigned char *parts[4], *encoded[4]; /* positions, normals, texture coordinates, indices */
+    unsigned char *parts[PARTS], *encoded[PARTS];
     size_t encoded_room;
     unsigned char *file;
     size_t file_room;
@@ -68,8 +69,8 @@ out_glb_encoder *out_glb_encoder_create(const scene_own_lattice *lattice, const 
     e->indices = tl_alloc(indices, sizeof *e->indices);
     e->encoded_room = meshopt_encodeVertexBufferBound(vertices, 8) + meshopt_encodeIndexBufferBound(indices, vertices);
     bool good = e->vertices && e->indices;
-    for (int k = 0; k < 4; k++) {
-        e->parts[k] = tl_alloc(k == 3 ? indices : vertices, 8);
+    for (int k = 0; k < PARTS; k++) {
+        e->parts[k] = tl_alloc(k == INDICES ? indices : vertices, 8);
         e->encoded[k] = style->compressed ? malloc(e->encoded_room) : NULL;
         good = good && e->parts[k] && (e->encoded[k] || !style->compressed);
     }
@@ -85,7 +86,7 @@ void out_glb_encoder_destroy(out_glb_encoder *e)
     if (!e)
         return;
     out_surface_finish(&e->surface);
-    for (int k = 0; k < 4; k++) {
+    for (int k = 0; k < PARTS; k++) {
         free(e->parts[k]);
         free(e->encoded[k]);
     }
@@ -141,15 +142,19 @@ static void round_vertices(out_glb_encoder *e, const out_glb_tile *t, double q, 
     for (size_t k = 0; k < e->surface.vertex_count; k++) {
         const out_surface_vertex *v = &e->surface.vertices[k];
         const double n[3] = {(double)v->normal[0], (double)v->normal[1], (double)v->normal[2]};
-        double at[3], up[3];
+        const double east[3] = {(double)v->tangent[0], (double)v->tangent[1], (double)v->tangent[2]};
+        double at[3], up[3], along[3];
         packed *to = &e->vertices[k];
         *to = (packed){.none = 0};
         to_gltf(v->at, at);
         to_gltf(n, up);
+        to_gltf(east, along);
         for (int a = 0; a < 3; a++) {
             to->position[a] = (uint16_t)(floor(at[a] / q + 0.5) - origin[a]);
             to->normal[a] = to_i8((float)up[a]);
+            to->tangent[a] = to_i8((float)along[a]);
         }
+        to->tangent[3] = 127; /* rows of pictures run to the south */
         if (!t->pictures)
             continue;
         to->uv[0] = texture_at((v->x - (double)t->x) / (double)t->step, cells);
@@ -171,13 +176,19 @@ static size_t order(out_glb_encoder *e)
 static void add_view(view *views, int *count, out_glb_encoder *e, int part, size_t items, size_t stride)
 {
     view *v = &views[(*count)++];
-    *v =
-        (view){.bytes = e->parts[part], .size = items * stride, .count = items, .stride = stride, .indices = part == 3};
+    *v = (view){
+        .bytes = e->parts[part], .size = items * stride, .count = items, .stride = stride, .indices = part == INDICES};
     if (!e->style.compressed)
         return;
     v->bytes = e->encoded[part];
     v->size = v->indices ? meshopt_encodeIndexBuffer(e->encoded[part], e->encoded_room, e->indices, items)
                          : meshopt_encodeVertexBuffer(e->encoded[part], e->encoded_room, e->parts[part], items, stride);
+}
+
+/* They are of no use without the normals that they stand beside. */
+static bool has_tangents(const out_glb_encoder *e, const out_glb_tile *t)
+{
+    return e->style.normals && t->pictures && t->pictures->bytes[1];
 }
 
 /* Positions, normals and texture coordinates where there are any, then indices, then pictures. */
@@ -187,23 +198,26 @@ static int make_views(out_glb_encoder *e, const out_glb_tile *t, size_t vertices
     size_t indices = e->surface.index_count;
     bool wide = vertices > STEPS; /* the last number of 16 bits is a mark in some interfaces */
     for (size_t k = 0; k < vertices; k++) {
-        memcpy(e->parts[0] + 8 * k, e->vertices[k].position, 8);
-        memcpy(e->parts[1] + 4 * k, e->vertices[k].normal, 4);
-        memcpy(e->parts[2] + 4 * k, e->vertices[k].uv, 4);
+        memcpy(e->parts[POSITIONS] + 8 * k, e->vertices[k].position, 8);
+        memcpy(e->parts[NORMALS] + 4 * k, e->vertices[k].normal, 4);
+        memcpy(e->parts[TANGENTS] + 4 * k, e->vertices[k].tangent, 4);
+        memcpy(e->parts[PLACES] + 4 * k, e->vertices[k].uv, 4);
     }
     for (size_t k = 0; k < indices; k++) {
         uint16_t narrow = (uint16_t)e->indices[k];
         if (wide)
-            memcpy(e->parts[3] + 4 * k, &e->indices[k], 4);
+            memcpy(e->parts[INDICES] + 4 * k, &e->indices[k], 4);
         else
-            memcpy(e->parts[3] + 2 * k, &narrow, 2);
+            memcpy(e->parts[INDICES] + 2 * k, &narrow, 2);
     }
-    add_view(views, &count, e, 0, vertices, 8);
+    add_view(views, &count, e, POSITIONS, vertices, 8);
     if (e->style.normals)
-        add_view(views, &count, e, 1, vertices, 4);
+        add_view(views, &count, e, NORMALS, vertices, 4);
+    if (has_tangents(e, t))
+        add_view(views, &count, e, TANGENTS, vertices, 4);
     if (t->pictures)
-        add_view(views, &count, e, 2, vertices, 4);
-    add_view(views, &count, e, 3, indices, wide ? 4 : 2);
+        add_view(views, &count, e, PLACES, vertices, 4);
+    add_view(views, &count, e, INDICES, indices, wide ? 4 : 2);
     for (int k = 0; t->pictures && k < 2; k++)
         if (t->pictures->bytes[k])
             views[count++] = (view){.bytes = t->pictures->bytes[k], .size = t->pictures->count[k]};
@@ -278,6 +292,10 @@ static json_t *describe_geometry(const out_glb_encoder *e, const out_glb_tile *t
     if (e->style.normals) {
         json_object_set_new(attributes, "NORMAL", json_integer((json_int_t)json_array_size(accessors)));
         add_accessor(accessors, COMPONENT_I8, vertices, "VEC3", true);
+    }
+    if (has_tangents(e, t)) {
+        json_object_set_new(attributes, "TANGENT", json_integer((json_int_t)json_array_size(accessors)));
+        add_accessor(accessors, COMPONENT_I8, vertices, "VEC4", true);
     }
     if (t->pictures) {
         json_object_set_new(attributes, "TEXCOORD_0", json_integer((json_int_t)json_array_size(accessors)));

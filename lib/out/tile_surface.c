@@ -248,6 +248,24 @@ static void find_normal(const out_glb_tile *t, const directions *d, const double
         v->normal[a] = (float)(length > 0 && isfinite(length) ? n[a] / length : up[a]);
 }
 
+/* A picture has the normals, in the axes of columns, rows and the vertical. */
+static void find_tangent(const out_glb_tile *t, const directions *d, const double up[3], out_surface_vertex *v)
+{
+    double side = (double)t->step * t->drawn->mesh->cells / (NODES - 1), along[3], upright = 0, length = 0;
+    mix_direction(d, (v->x - (double)t->x) / side, (v->y - (double)t->y) / side, 0, along);
+    for (int a = 0; a < 3; a++)
+        upright += along[a] * up[a];
+    for (int a = 0; a < 3; a++) {
+        along[a] -= upright * up[a];
+        length += along[a] * along[a];
+    }
+    const double any[3] = {-up[1], up[0], 0}; /* at a pole */
+    for (int a = 0; a < 3; a++) {
+        v->normal[a] = (float)up[a];
+        v->tangent[a] = (float)(length > 0 ? along[a] / sqrt(length) : any[a]);
+    }
+}
+
 static tl_status place_ground(out_surface *s, const out_glb_tile *t, tl_error *error)
 {
     directions d;
@@ -264,6 +282,8 @@ static tl_status place_ground(out_surface *s, const out_glb_tile *t, tl_error *e
         scene_to_ecef(v->longitude, v->latitude, v->z, v->at);
         scene_up(v->longitude, v->latitude, up);
         find_normal(t, &d, up, v);
+        if (t->pictures && t->pictures->bytes[1])
+            find_tangent(t, &d, up, v);
     }
     return TL_OK;
 }

@@ -8,8 +8,8 @@ typedef struct out_surface_vertex {
     double x, y, z;     /* vertex of the finest lattice, metres */
     double gradient[2]; /* metres of height in a cell of the tile's lattice */
     double longitude, latitude;
-    double at[3]; /* metres in the axes of the Earth */
-    float normal[3];
+    double at[3];                /* metres in the axes of the Earth */
+    float normal[3], tangent[3]; /* tangent: along rows, where a picture has the normals */
 } out_surface_vertex;
 
 typedef struct out_surface {

@@ -3,7 +3,7 @@
 
 #include "lib/base/error.h"
 #include "lib/base/georef.h"
-#include "lib/out/tile_glb.h"
+#include "lib/out/tile_pictures.h"
 #include "lib/out/tile_schemes.h"
 
 #include <meshoptimizer.h>
@@ -31,17 +31,35 @@ static double sag(const out_pyramid *p, int lattice, int size)
 
 /* ---- Contents ---- */
 
+typedef struct worker {
+    out_glb_encoder *encoder;
+    out_tile_painter *painter; /* NULL: no pictures */
+} worker;
+
+static void finish_worker(void *context)
+{
+    worker *w = context;
+    out_glb_encoder_destroy(w->encoder);
+    out_tile_painter_destroy(w->painter);
+    free(w);
+}
+
 static void *begin_worker(const out_pyramid *p, tl_error *error)
 {
     const out_glb_style style = {.normals = !p->options->no_normals,
                                  .compressed = p->options->coding == TL_CODING_COMPRESSED,
                                  .attribution = p->options->attribution};
-    return out_glb_encoder_create(p->lattice, &style, error);
-}
-
-static void finish_worker(void *worker)
-{
-    out_glb_encoder_destroy(worker);
+    worker *w = calloc(1, sizeof *w);
+    if (!w) {
+        tl_fail_memory(error, p->folder);
+        return NULL;
+    }
+    w->encoder = out_glb_encoder_create(p->lattice, &style, error);
+    w->painter = w->encoder && p->options->textures ? out_tile_painter_create(p, error) : NULL;
+    if (w->encoder && (w->painter || !p->options->textures))
+        return w;
+    finish_worker(w);
+    return NULL;
 }
 
 /* Down from an edge to that of a neighbour up to SKIRT_LEVELS levels coarser: the errors of both, where errors at most
@@ -51,18 +69,24 @@ static double skirt_of(const out_pyramid *p, const out_piece_tile *tile)
     return fmax(tile->error, out_pyramid_bound(p, tile->level)) * (1 + (1 << SKIRT_LEVELS));
 }
 
-static tl_status encode(const out_pyramid *p, void *worker, const out_drawn_tile *drawn, out_piece_tile *tile,
+static tl_status encode(const out_pyramid *p, void *context, const out_drawn_tile *drawn, out_piece_tile *tile,
                         const void **bytes, tl_error *error)
 {
     int64_t cells = (int64_t)OUT_TILE_CELLS << (p->deepest - tile->level);
-    const out_glb_tile glb = {.drawn = drawn,
-                              .x = tile->column * cells,
-                              .y = tile->row * cells,
-                              .step = cells / drawn->mesh->cells,
-                              .skirt = skirt_of(p, tile)};
+    worker *w = context;
+    out_glb_tile glb = {.drawn = drawn,
+                        .x = tile->column * cells,
+                        .y = tile->row * cells,
+                        .step = cells / drawn->mesh->cells,
+                        .skirt = skirt_of(p, tile)};
     out_glb_facts facts;
-    size_t count;
-    tl_status status = out_glb_encode(worker, &glb, bytes, &count, &facts, error);
+    size_t count = 0;
+    out_tile_pictures pictures;
+    tl_status status = w->painter ? out_tile_paint(w->painter, &glb, &pictures, error) : TL_OK;
+    if (w->painter)
+        glb.pictures = &pictures;
+    if (status == TL_OK)
+        status = out_glb_encode(w->encoder, &glb, bytes, &count, &facts, error);
     tile->bytes = (int64_t)count;
     if (status != TL_OK || !count)
         return status;

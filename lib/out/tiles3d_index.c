@@ -404,7 +404,10 @@ static json_t *describe_schema(void)
 
 static char *describe_tileset(const out_pyramid *p, const out_nodes *nodes)
 {
+    const double *r = nodes->levels[0].nodes[0].region;
     double error = halving_error(nodes, p->deepest);
+    json_t *record = out_describe_record(p); /* with where the tiles are, of the root's square */
+    json_object_set_new(record, "region", json_pack("[f,f,f,f,f,f]", r[0], r[1], r[2], r[3], r[4], r[5]));
     json_t *implicit =
         json_pack("{s:s, s:i, s:i, s:{s:s}}", "subdivisionScheme", "QUADTREE", "subtreeLevels", LEVELS,
                   "availableLevels", p->deepest + 1, "subtrees", "uri", "subtrees/{level}/{x}/{y}.subtree");
@@ -412,7 +415,7 @@ static char *describe_tileset(const out_pyramid *p, const out_nodes *nodes)
                              "1.1", "generator", "talus", "geometricError", 2 * error, "schema", describe_schema(),
                              "root", "boundingVolume", describe_volume(p, &nodes->levels[0].nodes[0]), "geometricError",
                              error, "refine", "REPLACE", "content", "uri", "content/{level}/{x}/{y}.glb",
-                             "implicitTiling", implicit, "extras", "talus", out_describe_record(p));
+                             "implicitTiling", implicit, "extras", "talus", record);
     char *text = root ? json_dumps(root, JSON_INDENT(1) | JSON_REAL_PRECISION(17)) : NULL;
     json_decref(root);
     return text;
