@@ -48,6 +48,38 @@ double fbm_pow(double x, double y)
     return fbm_exp2(y * fbm_log2(x));
 }
 
+enum { TOGETHER = 16 };
+
+/* fbm_exp2 of so many numbers at once. */
+static void exp2_together(double x[TOGETHER])
+{
+    double whole[TOGETHER], rest[TOGETHER], sum[TOGETHER];
+    for (int k = 0; k < TOGETHER; k++) {
+        double within = x[k] >= -1080 && x[k] <= 1024 ? x[k] : 0;
+        whole[k] = floor(within + 0.5);
+        rest[k] = (within - whole[k]) * ln2;
+        sum[k] = 1;
+    }
+    for (int n = 13; n >= 1; n--)
+        for (int k = 0; k < TOGETHER; k++)
+            sum[k] = 1 + sum[k] * rest[k] / n;
+    for (int k = 0; k < TOGETHER; k++)
+        x[k] = x[k] >= -1080 && x[k] <= 1024 ? ldexp(sum[k], (int)whole[k]) : fbm_exp2(x[k]);
+}
+
+void fbm_pow_all(const double *x, double y, double *out, size_t count)
+{
+    for (size_t from = 0; from < count; from += TOGETHER) {
+        double power[TOGETHER] = {0};
+        size_t some = count - from < TOGETHER ? count - from : TOGETHER;
+        for (size_t k = 0; k < some; k++)
+            power[k] = y * fbm_log2(x[from + k]);
+        exp2_together(power);
+        for (size_t k = 0; k < some; k++)
+            out[from + k] = x[from + k] == 0 ? fbm_pow(0, y) : power[k];
+    }
+}
+
 /* Cosine and sine of |x| <= pi / 4 by Taylor's series: the terms left out are below 2^-60. */
 static void turn_near_0(double x, double *cosine, double *sine)
 {

@@ -12,6 +12,9 @@ double fbm_exp2(double x);
 double fbm_log2(double x);
 /* x^y for finite x >= 0; 0^0 is 1. The relative error is that of the exponent, |y log2 x| 2^-52. */
 double fbm_pow(double x, double y);
+/* out[k] = fbm_pow(x[k], y), to the last bit, several times as fast: what one waits for the others use. May be in
+ * place. */
+void fbm_pow_all(const double *x, double y, double *out, size_t count);
 /* Cosine and sine of the turn 2 pi k / n, n > 0, n < 2^48, to 2^-52. Exact at multiples of a quarter turn. */
 void fbm_turn(size_t k, size_t n, double *cosine, double *sine);
 

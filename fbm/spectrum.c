@@ -125,19 +125,34 @@ static double sinc_square(double x)
     return s * s;
 }
 
+enum { NEARBY = (2 * ALIASES + 1) * (2 * ALIASES + 1) };
+
 /* |k|^-(2H+2), k in cycles a sample, over all frequencies that sampling cannot tell apart; those beyond the nearest
- * ones as an integral over a plane without a disc of their area. */
-static double aliased(const ordinates *o, double x, double y, double hurst)
+ * ones as an integral over a plane without a disc of their area: `rest`. */
+static double aliased(const ordinates *o, double x, double y, double hurst, double rest)
 {
-    double sum = 0;
+    double sum = 0, powers[NEARBY], across[2 * ALIASES + 1];
+    int n = 0;
     for (int b = -ALIASES; b <= ALIASES; b++)
         for (int a = -ALIASES; a <= ALIASES; a++) {
             double u = (x + a) * o->aspect, v = (y + b) / o->aspect;
-            double term = 1 / fbm_pow(u * u + v * v, hurst + 1);
-            sum += o->area ? term * sinc_square(x + a) * sinc_square(y + b) : term;
+            powers[n++] = u * u + v * v;
         }
-    double radius_square = (2 * ALIASES + 1) * (2 * ALIASES + 1) / 3.14159265358979323846;
-    return o->area ? sum : sum + 3.14159265358979323846 / hurst / fbm_pow(radius_square, hurst);
+    fbm_pow_all(powers, hurst + 1, powers, NEARBY);
+    if (!o->area) {
+        for (n = 0; n < NEARBY; n++)
+            sum += 1 / powers[n];
+        return sum + rest;
+    }
+    for (int a = -ALIASES; a <= ALIASES; a++)
+        across[a + ALIASES] = sinc_square(x + a);
+    n = 0;
+    for (int b = -ALIASES; b <= ALIASES; b++) {
+        double down = sinc_square(y + b);
+        for (int a = 0; a <= 2 * ALIASES; a++)
+            sum += 1 / powers[n++] * across[a] * down;
+    }
+    return sum;
 }
 
 /* Hann's taper gives a frequency 1/6, 2/3 and 1/6 of the power at its neighbours and itself, along either axis: the
@@ -155,9 +170,11 @@ static double smear(const double *model, size_t side, size_t i, size_t j)
 static void make_model(ordinates *o, double hurst)
 {
     size_t side = o->side, half = side / 2;
+    double radius_square = NEARBY / 3.14159265358979323846;
+    double rest = 3.14159265358979323846 / hurst / fbm_pow(radius_square, hurst);
     for (size_t j = 0; j <= half; j++)
         for (size_t i = 0; i <= half; i++) {
-            double value = i + j == 0 ? 0 : aliased(o, (double)i / (double)side, (double)j / (double)side, hurst);
+            double value = i + j == 0 ? 0 : aliased(o, (double)i / (double)side, (double)j / (double)side, hurst, rest);
             size_t across = (side - i) % side, down = (side - j) % side;
             o->model[j * side + i] = o->model[j * side + across] = o->model[down * side + i] =
                 o->model[down * side + across] = value;

@@ -123,21 +123,31 @@ typedef struct variogram {
     double *table; /* (TABLE + 1)^2 */
 } variogram;
 
-static double power_at(const variogram *v, double x, double y)
+static double square_at(const variogram *v, double x, double y)
 {
     x *= v->cell_x;
     y *= v->cell_y;
-    return fbm_pow(x * x + y * y, v->hurst);
+    return x * x + y * y;
 }
 
-/* The same for means over cells, but for a constant. The difference of two uniform points of a cell has the triangular
- * density; far off, only its variance counts: the Laplacian of r^2H is 4 H^2 r^(2H - 2), half of it times 1/6. */
+static double power_at(const variogram *v, double x, double y)
+{
+    return fbm_pow(square_at(v, x, y), v->hurst);
+}
+
+/* The power of means over cells far off, of that of points. The difference of two uniform points of a cell has the
+ * triangular density, of which only the variance counts there: the Laplacian of r^2H is 4 H^2 r^(2H - 2), half of it
+ * times 1/6. */
+static double of_means(const variogram *v, double square, double power)
+{
+    return power * (1 + v->hurst * v->hurst / 3 / square * v->cell_x * v->cell_y);
+}
+
+/* The same for means over cells, but for a constant. */
 static double power_of_means(const variogram *v, int x, int y)
 {
-    if (x > AREA_REACH || y > AREA_REACH) {
-        double dx = x * v->cell_x, dy = y * v->cell_y, r2 = dx * dx + dy * dy;
-        return fbm_pow(r2, v->hurst) * (1 + v->hurst * v->hurst / 3 / r2 * v->cell_x * v->cell_y);
-    }
+    if (x > AREA_REACH || y > AREA_REACH)
+        return of_means(v, square_at(v, x, y), power_at(v, x, y));
     double sum = 0, weights = 0;
     for (int a = 0; a < AREA_STEPS; a++)
         for (int b = 0; b < AREA_STEPS; b++) {
@@ -156,10 +166,22 @@ static bool variogram_init(variogram *v, const fbm_sampling *s, double hurst, in
     *v =
         (variogram){.hurst = hurst, .cell_x = s->cell_x, .cell_y = s->cell_y, .area = s->area && fabs(hurst - 1) > 0.1};
     v->table = calloc((TABLE + 1) * (TABLE + 1), sizeof *v->table);
-    for (int y = 0; v->table && y <= reach; y++)
+    double *squares = malloc((size_t)(reach + 1) * sizeof *squares);
+    for (int y = 0; v->table && squares && y <= reach; y++) {
+        double *row = v->table + y * (TABLE + 1);
         for (int x = 0; x <= reach; x++)
-            v->table[y * (TABLE + 1) + x] = v->area ? power_of_means(v, x, y) : power_at(v, x, y);
-    return v->table;
+            squares[x] = square_at(v, x, y);
+        fbm_pow_all(squares, hurst, row, (size_t)reach + 1);
+        for (int x = 0; v->area && x <= reach; x++)
+            row[x] = x > AREA_REACH || y > AREA_REACH ? of_means(v, squares[x], row[x]) : power_of_means(v, x, y);
+    }
+    bool good = v->table && squares;
+    free(squares);
+    if (!good) {
+        free(v->table);
+        v->table = NULL;
+    }
+    return good;
 }
 
 static double variogram_at(const variogram *v, int x, int y)
@@ -176,17 +198,37 @@ typedef struct increment {
 
 static const int stencils[3][3] = {{0}, {-1, 1, 0}, {1, -2, 1}};
 
-/* Covariance of two increments r apart: only the variogram is needed, for the weights add up to 0. */
-static double covariance_at(const variogram *v, increment a, increment b, int rx, int ry)
+/* Displacements of the places that two increments have to do with, and their weights. */
+typedef struct pairing {
+    int count, x[9], y[9];
+    double weight[9];
+} pairing;
+
+static pairing pair_up(increment a, increment b)
 {
-    double sum = 0;
+    pairing p = {.count = 0};
     for (int i = 0; i <= a.order; i++)
         for (int j = 0; j <= b.order; j++) {
-            int x = rx + j * b.lag * fbm_directions[b.direction][0] - i * a.lag * fbm_directions[a.direction][0];
-            int y = ry + j * b.lag * fbm_directions[b.direction][1] - i * a.lag * fbm_directions[a.direction][1];
-            sum -= 0.5 * stencils[a.order][i] * stencils[b.order][j] * variogram_at(v, x, y);
+            p.x[p.count] = j * b.lag * fbm_directions[b.direction][0] - i * a.lag * fbm_directions[a.direction][0];
+            p.y[p.count] = j * b.lag * fbm_directions[b.direction][1] - i * a.lag * fbm_directions[a.direction][1];
+            p.weight[p.count++] = 0.5 * stencils[a.order][i] * stencils[b.order][j];
         }
+    return p;
+}
+
+/* Covariance of two increments r apart: only the variogram is needed, for the weights add up to 0. */
+static double paired_covariance(const variogram *v, const pairing *p, int rx, int ry)
+{
+    double sum = 0;
+    for (int k = 0; k < p->count; k++)
+        sum -= p->weight[k] * variogram_at(v, rx + p->x[k], ry + p->y[k]);
     return sum;
+}
+
+static double covariance_at(const variogram *v, increment a, increment b, int rx, int ry)
+{
+    pairing p = pair_up(a, b);
+    return paired_covariance(v, &p, rx, ry);
 }
 
 /* Positions that an increment has in the raster. */
@@ -243,9 +285,10 @@ static double correlation_sum(const variogram *v, const node *nodes, size_t coun
 {
     /* above exponent 1 it is +1/2 |h|^2H that is a covariance of second differences */
     double scale = (v->hurst > 1 ? -1 : 1) / sqrt(covariance_at(v, a, a, 0, 0) * covariance_at(v, b, b, 0, 0));
+    const pairing pair = pair_up(a, b);
     double sum = 0;
     for (size_t k = 0; k < count; k++) {
-        double rho = scale * covariance_at(v, a, b, nodes[k].x, nodes[k].y), product = rho;
+        double rho = scale * paired_covariance(v, &pair, nodes[k].x, nodes[k].y), product = rho;
         for (int p = 1; p < power; p++)
             product *= rho;
         sum += nodes[k].weight * product;
