@@ -212,6 +212,22 @@ static double geodesic_step(const tl_crs *crs, double x, double y, double dx, do
            part;
 }
 
+tl_crs *tl_crs_create(const char *definition, tl_error *error)
+{
+    tl_crs *made = NULL;
+    return dem_crs_from_text(definition, definition, &made, error) == TL_OK ? made : NULL;
+}
+
+void tl_crs_destroy(tl_crs *crs)
+{
+    tl_crs_release(crs);
+}
+
+tl_status tl_georef_measure(tl_georef *georef, int64_t width, int64_t height, tl_error *error)
+{
+    return dem_georef_measure(georef, width, height, error);
+}
+
 tl_status dem_georef_measure(tl_georef *georef, int64_t width, int64_t height, tl_error *error)
 {
     (void)error;

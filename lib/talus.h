@@ -84,6 +84,10 @@ typedef enum tl_raster_type { TL_RASTER_AREA = 0, TL_RASTER_POINT } tl_raster_ty
 /* A coordinate reference system, shared and immutable; reference-counted by its owners. */
 typedef struct tl_crs tl_crs;
 
+/* The CRS of "EPSG:CODE", a WKT text of any version or a PROJ string; NULL, TL_ERROR_DATA, where PROJ knows none. */
+TL_API tl_crs *tl_crs_create(const char *definition, tl_error *error);
+/* For those of tl_crs_create; the CRS of a source goes with the source. Takes NULL. */
+TL_API void tl_crs_destroy(tl_crs *crs);
 /* Name of the CRS, as "NAD83 / UTM zone 11N"; never NULL. */
 TL_API const char *tl_crs_name(const tl_crs *crs);
 /* WKT2:2019 of the CRS on one line, a COMPOUNDCRS where it has a vertical part, a BOUNDCRS where a GeoTIFF without a
@@ -177,6 +181,11 @@ TL_API void tl_source_destroy(tl_source *source);
  * meridian, and latitude, in degrees on the CRS's own datum; in place, `count` points. Where there are none: NaN.
  * TL_ERROR_DATA where CRS or place are not known. */
 TL_API tl_status tl_georef_to_lonlat(const tl_georef *georef, size_t count, double *i, double *j, tl_error *error);
+/* Fills in cell_x and cell_y, in metres, of a georef whose crs, located and transform are set, for a raster of this
+ * many samples; and height_unit where it is 1 and the CRS has a vertical part. A raster that is not located has cells
+ * of 1.
+ */
+TL_API tl_status tl_georef_measure(tl_georef *georef, int64_t width, int64_t height, tl_error *error);
 /* The box of longitudes and latitudes (as above) around a raster: west, south, east, north, of the cells of an area
  * raster and of the samples of a point raster. West is in -180 ... 180, and east beyond 180 where the antimeridian is
  * crossed; a raster with a pole in it goes from -180 to 180. Measured at 65 points an edge. */
