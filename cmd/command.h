@@ -16,7 +16,7 @@ typedef struct command {
 } command;
 
 extern const command command_info, command_simplify, command_synth, command_preview, command_noise, command_stats,
-    command_view, command_fly, command_tiles, command_serve;
+    command_view, command_fly, command_tiles, command_serve, command_report;
 
 enum { DEFAULT_MEMORY = 512, OPENED_STEPS = 4 };
 

@@ -8,7 +8,7 @@
 
 static const command *const commands[] = {&command_info,  &command_simplify, &command_synth, &command_preview,
                                           &command_noise, &command_stats,    &command_view,  &command_fly,
-                                          &command_tiles, &command_serve};
+                                          &command_tiles, &command_serve,    &command_report};
 enum { COMMAND_COUNT = sizeof commands / sizeof *commands };
 
 static const command *find(const char *name)
