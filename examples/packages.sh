@@ -2,7 +2,7 @@
 
 build_packages="gcc g++ meson ninja-build pkg-config libtiff-dev libgeotiff-dev libproj-dev libgeographiclib-dev
 libopenexr-dev libmeshoptimizer-dev libpng-dev libdeflate-dev libjansson-dev libpopt-dev libkissfft-dev libcairo2-dev libmicrohttpd-dev scdoc"
-test_packages="libcmocka-dev clang clang-format libclang-rt-14-dev git"
+test_packages="gnuplot-nox libcmocka-dev clang clang-format libclang-rt-14-dev git"
 
 # Installs those of the named packages that are missing; does nothing, and asks nothing, when all are there.
 need_packages() {

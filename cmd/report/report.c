@@ -179,8 +179,9 @@ void report_describe(report *self, int argc, const char **argv)
 #else
                                   "gcc " __VERSION__,
 #endif
-                                  "quick", self->quick, "threads", (json_int_t)self->run->threads, "arguments",
-                                  command));
+                                  "quick", self->quick, "threads",
+                                  (json_int_t)(self->run->threads ? self->run->threads : sysconf(_SC_NPROCESSORS_ONLN)),
+                                  "arguments", command));
     json_object_set_new(self->root, "machine", describe_machine());
     json_object_set_new(self->root, "model", describe_model(&self->dem->info));
 }

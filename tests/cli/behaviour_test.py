@@ -457,6 +457,45 @@ def json_keeps_its_schema(case):
         raise AssertionError("the schema takes anything")
 
 
+def reports_keep_their_schema(case):
+    with open(os.path.join(ROOT, "doc", "report.schema.json"), encoding="utf-8") as file:
+        schema = json.load(file)
+    parts = ["framework", "amplification", "view", "stability"]
+    if not is_sanitized(case.program):  # many exact fields, which have tests of their own
+        parts.insert(1, "field")
+    case.run("report", EXAMPLE, "--window", "100,100,80,72", "--quick", "-q", "--sections", ",".join(parts), "-o", "made")
+    with open(case.path("made/report.json"), encoding="utf-8") as file:
+        about = json.load(file)
+    check_schema(about, schema)
+    sections = [section["key"] for section in about["sections"]]
+    expect(sections == parts, f"{sections}")
+    tables = {table["key"]: table for section in about["sections"] for table in section["tables"]}
+    for table in tables.values():
+        keys = {column["key"] for column in table["columns"]}
+        expect(table["rows"], f"{table['key']} is empty")
+        expect(all(set(row) <= keys for row in table["rows"]), f"{table['key']} has values without a column")
+        for plot in table["plots"]:
+            expect({plot["x"], plot["y"]} <= keys, f"{plot}")
+            with open(case.path(f"made/{plot['key']}.csv"), encoding="utf-8") as file:
+                lines = file.read().splitlines()
+            expect(len(lines) > 1 and len({len(line.split(",")) for line in lines}) == 1, f"{plot['key']}: {lines[:3]}")
+    bounds = tables["bounds"]["rows"]
+    expect(all(row["largest"] <= row["bound"] and row["verdict"] == "kept" for row in bounds), f"{bounds}")
+    ends = {row["verdict"] for row in tables["cases"]["rows"]}
+    expect(ends <= {"right", "refused"}, f"{ends}")
+    by = {(row["method"], row["factor"]): row for row in tables["methods"]["rows"]}
+    expect(by["terrain", 2]["slope"] < by["bilinear", 2]["slope"], "detail is no better than none")
+    with open(case.path("made/report.html"), encoding="utf-8") as file:
+        page = file.read()
+    expect(page.count("<section>") == len(parts), "no page")
+    expect("<script" not in page and "src=" not in page, "the page needs something beside it")
+    if shutil.which("gnuplot"):
+        expect(page.count("<svg") == sum(len(table["plots"]) for table in tables.values()), "plots are missing")
+    case.run("report", EXAMPLE, "--quick", "-o", "made", status=1)
+    case.run("report", EXAMPLE, "--sections", "fields", "-o", "other", status=2)
+    case.run("report", EXAMPLE, status=2)
+
+
 def statistics_keep_their_schema(case):
     with open(os.path.join(ROOT, "doc", "stats.schema.json"), encoding="utf-8") as file:
         schema = json.load(file)
@@ -1043,6 +1082,8 @@ def manuals_show_what_works(case):
         words = re.sub(r"--levels \d+", "--levels 1", line).split()[1:]  # the same, in less time
         if words[0] == "synth" and not {"--levels", "-l", "--same-as"} & set(words):
             words += ["--levels", "1"]
+        if words[0] == "report":  # reports_keep_their_schema looks at the others
+            words += ["--sections", "stability"]
         if "-o" in words:
             replace = [] if words[0] == "tiles" else ["--overwrite"]  # a pyramid wants an empty folder
             expect(case.start(*words, "-q", *replace, stderr=subprocess.DEVNULL).wait(120) == 0, line)
@@ -1292,7 +1333,7 @@ TESTS = [
     follows_the_umask,
     tells_a_full_stdout, tells_a_broken_pipe, closed_streams_do_not_go_into_the_output,
     bar_only_on_a_terminal, progress_lines_are_json, quiet_is_silent,
-    json_keeps_its_schema, statistics_keep_their_schema, real_files_keep_the_schema, window_costs_its_blocks, a_part_is_that_part, corners_agree_with_gdal,
+    json_keeps_its_schema, reports_keep_their_schema, statistics_keep_their_schema, real_files_keep_the_schema, window_costs_its_blocks, a_part_is_that_part, corners_agree_with_gdal,
     names_of_any_bytes,
     serves_the_folder_alone, tiles_of_nothing_are_refused, formats_hold_the_same_heights, outputs_are_read_back, sidecars_are_checked, outputs_are_made_again, png_within_half_a_step, point_samples_are_kept, point_samples_of_the_andes_are_kept,
     area_means_stay_on_their_footprint,
