@@ -18,11 +18,12 @@ fbm_window fbm_relief_support(fbm_window children)
     return in;
 }
 
-/* The kernel lays its planes out in this: 12 of cells and one of children, with their margins, and 21 rows. */
-size_t fbm_relief_scratch(size_t width, size_t height)
+/* The kernel lays its rings out in this, with their margins: 16 of 8 rows of cells and 2 of 8 double rows of children,
+ * and 38 rows. */
+size_t fbm_relief_scratch(size_t width)
 {
-    size_t columns = width / 2 + 1 + 2 * FBM_RELIEF_MARGIN, rows = height / 2 + 1 + 2 * FBM_RELIEF_MARGIN;
-    return (columns + 32) * rows * 12 + (2 * columns + 32) * (2 * rows + 21);
+    size_t columns = width / 2 + 1 + 2 * FBM_RELIEF_MARGIN;
+    return (columns + 32) * (8 * (16 + 2 * 4) + 38);
 }
 
 size_t fbm_energy_scratch(size_t width, size_t height)

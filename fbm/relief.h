@@ -37,8 +37,8 @@ typedef struct fbm_relief_step {
 
 /* The cells from which a window of children is made. */
 fbm_window fbm_relief_support(fbm_window children);
-/* Floats of scratch for a window of children of this size. Never less for a larger one. */
-size_t fbm_relief_scratch(size_t width, size_t height);
+/* Floats of scratch for a window of children of this width, whatever its height. Never less for a greater one. */
+size_t fbm_relief_scratch(size_t width);
 /* Makes a window of children, and their energies (and slacks) if `out_energy` is not NULL (same window), from the
  * heights and energies (and slacks) of fbm_relief_support(). All must be finite. */
 void fbm_relief_refine(const fbm_relief_step *step, const float *heights, const float *energy, fbm_window in,

@@ -69,7 +69,7 @@ static void free_cells(cells c)
 static float *refine(size_t kernel, const fbm_relief_step *step, cells in, fbm_window children, float *energy)
 {
     float *out = allocate(children.stride * children.height);
-    float *scratch = allocate(fbm_relief_scratch(children.width, children.height));
+    float *scratch = allocate(fbm_relief_scratch(children.width));
     fbm_relief_kernels()[kernel]->refine(fbm_kernels()[kernel], step, in.heights, in.energy, in.window, out, energy,
                                          children, scratch);
     free(scratch);

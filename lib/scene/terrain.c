@@ -107,7 +107,7 @@ static tl_status layer_refine(const fbm_relief_step *step, layer *l, fbm_window 
 {
     layer finer;
     tl_status status = layer_init(&finer, children, name, error);
-    float *scratch = tl_alloc(fbm_relief_scratch(children.width, children.height), sizeof *scratch);
+    float *scratch = tl_alloc(fbm_relief_scratch(children.width), sizeof *scratch);
     if (status == TL_OK && !scratch)
         status = tl_fail_memory(error, name);
     if (status == TL_OK) {
@@ -147,7 +147,7 @@ tl_status scene_terrain_read(const scene_terrain *t, const tl_source *dem, int l
     layer l = {.heights = NULL};
     scene_patch ground = {.heights = NULL};
     tl_status status = descend(t, dem, windows, level - 1, &l, &ground, error);
-    float *scratch = tl_alloc(fbm_relief_scratch(window.width, window.height), sizeof *scratch);
+    float *scratch = tl_alloc(fbm_relief_scratch(window.width), sizeof *scratch);
     if (status == TL_OK && !scratch)
         status = tl_fail_memory(error, dem->info.name);
     if (status == TL_OK)
@@ -295,7 +295,7 @@ static tl_status spot_means_init(const survey *s, uint64_t item, spot_means *m, 
         return TL_OK;
     m->window = fbm_relief_support(m->children);
     m->means = tl_alloc_grid((int64_t)m->window.width, (int64_t)m->window.height, sizeof *m->means);
-    m->scratch = tl_alloc(fbm_relief_scratch(width, height), sizeof *m->scratch);
+    m->scratch = tl_alloc(fbm_relief_scratch(width), sizeof *m->scratch);
     if (!m->means || !m->scratch)
         return tl_fail_memory(error, name);
     return scene_patch_read(s->dem, s->terrain->growth, scene_widened(spot, 2 * FBM_RELIEF_MARGIN + 2), &m->patch,
@@ -415,7 +415,7 @@ static tl_status calibrate_slopes(void *context, tl_parallel *loop, uint64_t ite
     layer l = {.heights = NULL};
     scene_patch patch = {.heights = NULL};
     tl_status status = descend(s->terrain, s->dem, windows, s->octave, &l, &patch, error);
-    float *scratch = tl_alloc(fbm_relief_scratch(children.width, children.height), sizeof *scratch);
+    float *scratch = tl_alloc(fbm_relief_scratch(children.width), sizeof *scratch);
     if (status == TL_OK && !scratch)
         status = tl_fail_memory(error, s->dem->info.name);
     if (status == TL_OK) {
@@ -452,7 +452,7 @@ static tl_status calibrate_sums(void *context, tl_parallel *loop, uint64_t item,
     layer l = {.heights = NULL}, ground = {.heights = NULL};
     scene_patch patch = {.heights = NULL}, under = {.heights = NULL};
     tl_status status = descend(s->terrain, s->dem, windows, s->octave, &l, &patch, error);
-    float *scratch = tl_alloc(fbm_relief_scratch(children.width, children.height), sizeof *scratch);
+    float *scratch = tl_alloc(fbm_relief_scratch(children.width), sizeof *scratch);
     if (status == TL_OK && !scratch)
         status = tl_fail_memory(error, s->dem->info.name);
     spot_sums *sums = &s->each[item];

@@ -195,7 +195,7 @@ static void plan_terrain(terrain_chain *c, size_t side)
             c->energy[l][k] = 1;
         }
     }
-    c->scratch = allocate(fbm_relief_scratch(side, side), sizeof(float));
+    c->scratch = allocate(fbm_relief_scratch(side), sizeof(float));
 }
 
 static void measure_terrain(size_t side)
