@@ -40,6 +40,11 @@ static fbm_window dense(int64_t i, int64_t j, size_t width, size_t height)
     return (fbm_window){i, j, width, height, width};
 }
 
+static size_t area(fbm_window w)
+{
+    return w.width * w.height;
+}
+
 /* The cells of level `level` in a window of cells of level 0, and the other way round. */
 static fbm_window finer(fbm_window w, int level)
 {
@@ -69,40 +74,55 @@ static fbm_window whole_cells(const scene_cell_means *m, int level, fbm_window w
 }
 
 /* Points from which a window is made: for itself, and for the means over its cells. */
-static fbm_window points_window(const scene_cell_means *m, const scene_chain *chain, int level, fbm_window window)
+fbm_window scene_cell_means_support(const scene_cell_means *m, const scene_chain *chain, int level, fbm_window window)
 {
     scene_chain_target itself = target_of(level, window, NULL),
                        cells = target_of(m->level, whole_cells(m, level, window), NULL);
     return hull(scene_chain_support(chain, &itself), scene_chain_support(chain, &cells));
 }
 
-/* What the means must be known of, so that the points can be chosen. */
-static fbm_window errors_window(fbm_window at)
+enum { CELLS_AT_ONCE = 8 };
+
+/* Adds a row's parts of `count` cells to their sums, side by side, for a sum waits for the one before. */
+static inline void add_parts(const float *heights, int level, size_t count, double *sums)
 {
-    return scene_widened(at, SCENE_MEANS_REACH);
+    double of[CELLS_AT_ONCE];
+    for (size_t x = 0; x < count; x++)
+        of[x] = sums[x];
+    for (size_t part = 0; part < (size_t)1 << level; part++)
+        for (size_t x = 0; x < count; x++)
+            of[x] += (double)heights[(x << level) + part];
+    for (size_t x = 0; x < count; x++)
+        sums[x] = of[x];
 }
 
-fbm_window scene_cell_means_support(const scene_cell_means *m, const scene_chain *chain, int level, fbm_window window)
+/* Means over the cells of level 0 in `window`, of the heights of their parts at the level of means. */
+static void average(const scene_cell_means *m, fbm_window window, const float *heights, size_t stride, double *out)
 {
-    fbm_window errors = errors_window(points_window(m, chain, level, window));
-    scene_chain_target cells = target_of(m->level, finer(errors, m->level), NULL);
-    return hull(errors, scene_chain_support(chain, &cells));
+    memset(out, 0, area(window) * sizeof *out);
+    for (size_t y = 0; y < window.height << m->level; y++, heights += stride) {
+        double *sums = out + (y >> m->level) * window.width;
+        size_t x = 0;
+        for (; x + CELLS_AT_ONCE <= window.width; x += CELLS_AT_ONCE)
+            add_parts(heights + (x << m->level), m->level, CELLS_AT_ONCE, sums + x);
+        add_parts(heights + (x << m->level), m->level, window.width - x, sums + x);
+    }
+    const double share = ldexp(1, -2 * m->level);
+    for (size_t k = 0; k < area(window); k++)
+        out[k] *= share;
 }
 
-/* Means over the cells of level 0 in `window` of the field made from points. */
-static tl_status means_of(const scene_cell_means *m, const scene_chain *chain, points *p, fbm_window window,
+/* Those of the field made from points. */
+static tl_status means_of(const scene_cell_means *m, const scene_chain *chain, const points *p, fbm_window window,
                           double *out, const char *name, tl_error *error)
 {
     fbm_window fine = finer(window, m->level);
     float *heights = tl_alloc_grid((int64_t)fine.width, (int64_t)fine.height, sizeof *heights);
     scene_chain_target target = target_of(m->level, fine, heights);
-    tl_status status = heights ? scene_chain_run(chain, &target, load, p, name, error) : tl_fail_memory(error, name);
-    memset(out, 0, window.width * window.height * sizeof *out);
-    for (size_t y = 0; y < fine.height && status == TL_OK; y++)
-        for (size_t x = 0; x < fine.width; x++)
-            out[(y >> m->level) * window.width + (x >> m->level)] += (double)heights[y * fine.width + x];
-    for (size_t k = 0; k < window.width * window.height; k++)
-        out[k] = ldexp(out[k], -2 * m->level);
+    points at = *p;
+    tl_status status = heights ? scene_chain_run(chain, &target, load, &at, name, error) : tl_fail_memory(error, name);
+    if (status == TL_OK)
+        average(m, window, heights, fine.width, out);
     free(heights);
     return status;
 }
@@ -180,11 +200,15 @@ static void invert(double response[SIDE][SIDE], double inverse[2 * REACH + 1][2 
             inverse[y][x] /= sum; /* a plateau is kept */
 }
 
-tl_status scene_cell_means_measure(const scene_chain *chain, int64_t row, int levels, scene_cell_means *out,
-                                   const char *name, tl_error *error)
+tl_status scene_cell_means_measure(const scene_chain *chain, int64_t width, int64_t row, int levels,
+                                   scene_cell_means *out, const char *name, tl_error *error)
 {
-    *out =
-        (scene_cell_means){.level = levels < SCENE_MEANS_LEVEL ? levels : SCENE_MEANS_LEVEL, .placed = chain->placed};
+    *out = (scene_cell_means){.level = levels < SCENE_MEANS_LEVEL ? levels : SCENE_MEANS_LEVEL,
+                              .placed = chain->placed,
+                              .lacking = scene_cell_store_create(width),
+                              .points = scene_cell_store_create(width)};
+    if (!out->lacking || !out->points)
+        return tl_fail_memory(error, name);
     scene_chain smooth = *chain; /* shares what it points to */
     smooth.mapped = smooth.placed;
     for (int l = 0; l <= SCENE_LEVEL_MAX; l++)
@@ -233,19 +257,22 @@ static const double *inverse_at(const scene_cell_means *m, const scene_planes *p
     return room;
 }
 
-static void choose_points(const scene_cell_means *m, const scene_patch *patch, const double *errors, points *p)
+/* For a window, from what the means of another lack. */
+static void choose_points(const scene_cell_means *m, const scene_ground *ground, fbm_window known, const double *errors,
+                          fbm_window w, double *out)
 {
-    fbm_window w = p->window;
-    size_t stride = w.width + 2 * REACH;
+    size_t stride = known.width;
     double room[TAPS];
+    errors += (size_t)(w.j - REACH - known.j) * stride + (size_t)(w.i - REACH - known.i);
     for (size_t y = 0; y < w.height; y++)
         for (size_t x = 0; x < w.width; x++) {
-            double sum = (double)patch_height(patch, w.i + (int64_t)x, w.j + (int64_t)y);
-            const double *inverse = inverse_at(m, p->planes, w.i + (int64_t)x, w.j + (int64_t)y, room) + TAPS - 1;
+            int64_t i = w.i + (int64_t)x, j = w.j + (int64_t)y;
+            double sum = (double)patch_height(&ground->patch, i, j);
+            const double *inverse = inverse_at(m, &ground->planes, i, j, room) + TAPS - 1;
             for (size_t v = 0; v <= 2 * REACH; v++)
                 for (size_t u = 0; u <= 2 * REACH; u++)
                     sum += *inverse-- * errors[(y + v) * stride + x + u];
-            p->heights[y * w.width + x] = (float)sum;
+            *out++ = sum;
         }
 }
 
@@ -256,50 +283,152 @@ static double bump(int64_t k, int level)
     return 6 * u * (1 - u);
 }
 
+/* `bumps`: room for a row. */
 static void add_bumps(const scene_cell_means *m, int level, fbm_window window, fbm_window cells, const double *errors,
-                      float *out)
+                      double *bumps, float *out)
 {
     /* the mean of a bump over n midpoints is 1 + 1 / (2 n^2) */
     double one = 1 + ldexp(.5, -2 * m->level), scale = 1 / (one * one);
+    const int64_t right = window.i + (int64_t)window.width;
+    for (size_t x = 0; x < window.width; x++)
+        bumps[x] = bump(window.i + (int64_t)x, level);
     for (size_t y = 0; y < window.height; y++) {
         int64_t row = window.j + (int64_t)y;
         const double *error = errors + (size_t)((row >> level) - cells.j) * cells.width;
         double down = bump(row, level) * scale;
-        for (size_t x = 0; x < window.width; x++) {
-            int64_t column = window.i + (int64_t)x;
-            out[y * window.stride + x] += (float)(error[(column >> level) - cells.i] * down * bump(column, level));
+        float *line = out + y * window.stride;
+        for (int64_t column = window.i, end; column < right; column = end) {
+            end = tl_int64_min(((column >> level) + 1) * ((int64_t)1 << level), right);
+            const double lacking = error[(column >> level) - cells.i] * down;
+            for (int64_t x = column - window.i; x < end - window.i; x++)
+                line[x] += (float)(lacking * bumps[x]);
         }
     }
 }
 
-static size_t area(fbm_window w)
+/* What is made from a raster. */
+typedef struct making {
+    const scene_cell_means *means;
+    const scene_chain *chain;
+    scene_ground_read read;
+    const void *context;
+    const char *name;
+} making;
+
+static points points_of(const scene_chain *chain, fbm_window window, float *heights, const scene_ground *ground)
 {
-    return w.width * w.height;
+    return (points){window, heights, chain->mapped ? &ground->planes : NULL};
+}
+
+/* What the raster's own samples, taken for points, lack of its means. */
+static tl_status make_lacking(const void *context, fbm_window window, double *out, tl_error *error)
+{
+    const making *of = context;
+    scene_chain_target cells = target_of(of->means->level, finer(window, of->means->level), NULL);
+    scene_ground ground = {.patch = {.heights = NULL}};
+    tl_status status = of->read(of->context, hull(window, scene_chain_support(of->chain, &cells)), &ground, error);
+    if (status == TL_OK) {
+        points own = points_of(of->chain, ground.patch.window, ground.patch.heights, &ground);
+        status = means_of(of->means, of->chain, &own, window, out, of->name, error);
+    }
+    if (status == TL_OK)
+        errors_of(&ground.patch, window, out);
+    scene_ground_free(&ground);
+    return status;
+}
+
+static tl_status make_points(const void *context, fbm_window window, double *out, tl_error *error)
+{
+    const making *of = context;
+    const fbm_window wide = scene_cell_store_window(scene_widened(window, SCENE_MEANS_REACH));
+    scene_ground ground = {.patch = {.heights = NULL}};
+    double *errors = tl_alloc(area(wide), sizeof *errors);
+    tl_status status = errors ? of->read(of->context, window, &ground, error) : tl_fail_memory(error, of->name);
+    if (status == TL_OK)
+        status = scene_cell_store_read(of->means->lacking, wide, make_lacking, of, errors, of->name, error);
+    if (status == TL_OK)
+        choose_points(of->means, &ground, wide, errors, window, out);
+    scene_ground_free(&ground);
+    free(errors);
+    return status;
+}
+
+/* The points of a window; those around it are kept. */
+static tl_status read_points(const making *of, fbm_window window, float *out, tl_error *error)
+{
+    const fbm_window wide = scene_cell_store_window(window);
+    double *numbers = tl_alloc(area(wide), sizeof *numbers);
+    if (!numbers)
+        return tl_fail_memory(error, of->name);
+    tl_status status = scene_cell_store_read(of->means->points, wide, make_points, of, numbers, of->name, error);
+    const double *from = numbers + (size_t)(window.j - wide.j) * wide.width + (size_t)(window.i - wide.i);
+    for (size_t k = 0; status == TL_OK && k < area(window); k++)
+        out[k] = (float)from[k / window.width * wide.width + k % window.width];
+    free(numbers);
+    return status;
+}
+
+/* Makes the field from points, and the means over the cells that the window touches: of the same heights, where these
+ * are at the level of means. */
+static tl_status make_field(const making *of, int level, fbm_window window, points *p, fbm_window cells, double *means,
+                            float *out, tl_error *error)
+{
+    const scene_cell_means *m = of->means;
+    const fbm_window fine = finer(cells, level);
+    const bool all = fine.width == window.width && fine.height == window.height;
+    if (level != m->level || all) {
+        scene_chain_target target = target_of(level, window, out);
+        tl_status status = scene_chain_run(of->chain, &target, load, p, of->name, error);
+        if (status == TL_OK && level == m->level)
+            average(m, cells, out, window.stride, means);
+        else if (status == TL_OK)
+            status = means_of(m, of->chain, p, cells, means, of->name, error);
+        return status;
+    }
+    float *heights = tl_alloc_grid((int64_t)fine.width, (int64_t)fine.height, sizeof *heights);
+    if (!heights)
+        return tl_fail_memory(error, of->name);
+    scene_chain_target target = target_of(level, fine, heights);
+    tl_status status = scene_chain_run(of->chain, &target, load, p, of->name, error);
+    if (status == TL_OK)
+        average(m, cells, heights, fine.width, means);
+    const float *from = heights + (size_t)(window.j - fine.j) * fine.width + (size_t)(window.i - fine.i);
+    for (size_t row = 0; row < window.height && status == TL_OK; row++)
+        memcpy(out + row * window.stride, from + row * fine.width, window.width * sizeof *out);
+    free(heights);
+    return status;
 }
 
 tl_status scene_cell_means_run(const scene_cell_means *m, const scene_chain *chain, int level, fbm_window window,
-                               const scene_patch *patch, const scene_planes *planes, float *out, const char *name,
-                               tl_error *error)
+                               const scene_ground *ground, scene_ground_read read, const void *context, float *out,
+                               const char *name, tl_error *error)
 {
-    fbm_window at = points_window(m, chain, level, window), wide = errors_window(at), cells = coarser(window, level);
-    points own = {patch->window, patch->heights, planes}, chosen = {at, tl_alloc(area(at), sizeof(float)), planes};
-    double *errors = tl_alloc(area(wide), sizeof *errors);
-    tl_status status = chosen.heights && errors ? TL_OK : tl_fail_memory(error, name);
+    const making of = {m, chain, read, context, name};
+    fbm_window at = scene_cell_means_support(m, chain, level, window), cells = coarser(window, level);
+    float *heights = tl_alloc(area(at), sizeof *heights);
+    double *errors = tl_alloc(area(cells) + window.width, sizeof *errors), *bumps = errors + area(cells);
+    points chosen = points_of(chain, at, heights, ground);
+    tl_status status = heights && errors ? read_points(&of, at, heights, error) : tl_fail_memory(error, name);
     if (status == TL_OK)
-        status = means_of(m, chain, &own, wide, errors, name, error);
+        status = make_field(&of, level, window, &chosen, cells, errors, out, error);
     if (status == TL_OK) {
-        errors_of(patch, wide, errors);
-        choose_points(m, patch, errors, &chosen);
-        scene_chain_target target = target_of(level, window, out);
-        status = scene_chain_run(chain, &target, load, &chosen, name, error);
+        errors_of(&ground->patch, cells, errors);
+        add_bumps(m, level, window, cells, errors, bumps, out);
     }
-    if (status == TL_OK)
-        status = means_of(m, chain, &chosen, cells, errors, name, error);
-    if (status == TL_OK) {
-        errors_of(patch, cells, errors);
-        add_bumps(m, level, window, cells, errors, out);
-    }
-    free(chosen.heights);
+    free(heights);
     free(errors);
     return status;
+}
+
+void scene_cell_means_finish(scene_cell_means *m)
+{
+    scene_cell_store_destroy(m->lacking);
+    scene_cell_store_destroy(m->points);
+}
+
+void scene_ground_free(scene_ground *ground)
+{
+    scene_patch_free(&ground->patch);
+    for (int p = 0; p < SCENE_PLANES; p++)
+        free(ground->planes.of[p]);
 }

@@ -7,6 +7,7 @@
 #include "lib/base/number.h"
 #include "lib/base/size.h"
 #include "lib/scene/cell_means.h"
+#include "lib/scene/cell_store.h"
 #include "lib/scene/chain.h"
 #include "lib/scene/field_map.h"
 #include "lib/scene/patch.h"
@@ -32,9 +33,11 @@ typedef struct field {
     const tl_source *dem;
     const char *scheme;
     scene_chain chain;
-    scene_terrain *terrain; /* of cell means, or the strengths of the chain's noise; NULL: neither */
-    scene_cell_means means; /* level 0: not for this field */
-    scene_growth growth;    /* beyond the rim, but for its rings */
+    scene_terrain *terrain;               /* of cell means, or the strengths of the chain's noise; NULL: neither */
+    scene_cell_means means;               /* level 0: not for this field */
+    scene_growth growth;                  /* beyond the rim, but for its rings */
+    scene_cell_store *kept[SCENE_PLANES]; /* what maps say of cells; NULL: it is not kept */
+    scene_cell_store *rim;                /* patches that reach beyond the model, or have voids */
     /* Fields of exponent and delta; without sources where there is no map. */
     scene_field_map maps[SCENE_PLANES];
     double units[UNITS]; /* sigma over delta at exponents 0.01, 0.02 ...; all 1 where the map is of delta */
@@ -70,18 +73,11 @@ static void cut_voids(const scene_patch *g, bool area, int level, tl_window wind
 
 /* ---- reading ---- */
 
-/* Level 0 under a block: a patch that may reach farther than the chain asks for, and planes of the window that it asks
- * for. */
-typedef struct ground {
-    scene_patch patch;
-    scene_planes planes;
-} ground;
-
 static tl_status load(void *context, fbm_window window, float *buffer, float *const planes[SCENE_PLANES],
                       tl_error *error)
 {
     (void)error;
-    const ground *g = context;
+    const scene_ground *g = context;
     const fbm_window *w = &g->patch.window;
     assert(window.i >= w->i && window.j >= w->j && window.width <= w->width && window.height <= w->height);
     const float *from = g->patch.heights + (size_t)(window.j - w->j) * w->width + (size_t)(window.i - w->i);
@@ -117,6 +113,53 @@ static tl_status read_maps(const field *f, fbm_window window, scene_planes *out,
     return status;
 }
 
+/* What read_maps makes of one plane. */
+static tl_status make_plane(const field *f, fbm_window window, int plane, double *out, tl_error *error)
+{
+    size_t count = window.width * window.height;
+    float *delta = tl_alloc(count, 2 * sizeof *delta);
+    if (!delta)
+        return tl_fail_memory(error, f->dem->info.name);
+    float *hurst = f->chain.placed ? delta + count : NULL;
+    scene_planes planes = {window, {[SCENE_STRENGTH] = delta, [SCENE_HURST] = hurst}};
+    tl_status status = read_maps(f, window, &planes, error);
+    for (size_t k = 0; status == TL_OK && k < count; k++)
+        out[k] = (double)planes.of[plane][k];
+    free(delta);
+    return status;
+}
+
+static tl_status make_strengths(const void *context, fbm_window window, double *out, tl_error *error)
+{
+    return make_plane(context, window, SCENE_STRENGTH, out, error);
+}
+
+static tl_status make_hursts(const void *context, fbm_window window, double *out, tl_error *error)
+{
+    return make_plane(context, window, SCENE_HURST, out, error);
+}
+
+/* The planes of maps, what is known of them being kept. */
+static tl_status recall_maps(const field *f, fbm_window window, scene_planes *out, tl_error *error)
+{
+    static const scene_cell_store_make make[SCENE_PLANES] = {
+        [SCENE_STRENGTH] = make_strengths, [SCENE_HURST] = make_hursts};
+    const char *name = f->dem->info.name;
+    const fbm_window wide = scene_cell_store_window(window);
+    double *numbers = tl_alloc_grid((int64_t)wide.width, (int64_t)wide.height, sizeof *numbers);
+    tl_status status = numbers ? TL_OK : tl_fail_memory(error, name);
+    const size_t first = (size_t)(window.j - wide.j) * wide.width + (size_t)(window.i - wide.i);
+    for (int p = 0; p < SCENE_PLANES && status == TL_OK; p++) {
+        if (!out->of[p])
+            continue;
+        status = scene_cell_store_read(f->kept[p], wide, make[p], f, numbers, name, error);
+        for (size_t k = 0; status == TL_OK && k < window.width * window.height; k++)
+            out->of[p][k] = (float)numbers[first + k / window.width * wide.width + k % window.width];
+    }
+    free(numbers);
+    return status;
+}
+
 /* What fBm is made with beyond the rim and in voids: what the maps say there, or at their own rims. */
 static tl_status read_growth(const void *context, fbm_window window, float *delta, float *hurst, tl_error *error)
 {
@@ -124,10 +167,10 @@ static tl_status read_growth(const void *context, fbm_window window, float *delt
     scene_planes planes = {window, {[SCENE_STRENGTH] = delta, [SCENE_HURST] = f->chain.placed ? hurst : NULL}};
     for (size_t k = 0; !f->chain.placed && k < window.width * window.height; k++)
         hurst[k] = 0;
-    return read_maps(f, window, &planes, error);
+    return recall_maps(f, window, &planes, error);
 }
 
-static tl_status read_planes(const field *f, fbm_window window, ground *g, tl_error *error)
+static tl_status read_planes(const field *f, fbm_window window, scene_ground *g, tl_error *error)
 {
     const char *name = f->dem->info.name;
     g->planes.window = window;
@@ -139,27 +182,91 @@ static tl_status read_planes(const field *f, fbm_window window, ground *g, tl_er
         }
     if (f->terrain)
         return scene_terrain_strengths(f->terrain, &g->patch, window, g->planes.of[SCENE_STRENGTH], name, error);
-    return read_maps(f, window, &g->planes, error);
+    return recall_maps(f, window, &g->planes, error);
 }
 
-static tl_status ground_read(const field *f, fbm_window window, ground *g, tl_error *error)
+static scene_growth growth_of(const field *f)
 {
-    int rings = GROWTH + ROW_GROWTH * f->chain.shape.halvings;
     scene_growth growth = f->growth;
-    growth.rings = rings;
+    growth.rings = GROWTH + ROW_GROWTH * f->chain.shape.halvings;
     growth.by_place = f->chain.mapped && !f->terrain ? read_growth : NULL;
     growth.context = f;
-    *g = (ground){.planes = {.of = {NULL}}};
+    return growth;
+}
+
+/* A sample of a patch as a number that is only ever copied. */
+static tl_status make_rim(const void *context, fbm_window window, double *out, tl_error *error)
+{
+    const field *f = context;
+    scene_patch patch;
+    tl_status status = scene_patch_read(f->dem, growth_of(f), window, &patch, error);
+    if (status != TL_OK)
+        return status;
+    for (size_t k = 0; k < window.width * window.height; k++) {
+        uint64_t known = patch.known ? patch.known[k] : SCENE_MODEL;
+        uint32_t height;
+        memcpy(&height, &patch.heights[k], sizeof height);
+        const uint64_t both = known << 32 | height;
+        memcpy(&out[k], &both, sizeof both);
+    }
+    scene_patch_free(&patch);
+    return TL_OK;
+}
+
+/* Whether a patch takes long to make. */
+static bool is_rim(const field *f, fbm_window w)
+{
+    const tl_source_info *dem = &f->dem->info;
+    return dem->has_voids || f->dem->validity || w.j < 0 || w.j + (int64_t)w.height > dem->height ||
+           (!dem->wraps && (w.i < 0 || w.i + (int64_t)w.width > dem->width));
+}
+
+/* The patch of a window; what was made up of it is kept, for the windows beside it need much the same. */
+static tl_status recall_patch(const field *f, fbm_window window, scene_patch *out, tl_error *error)
+{
+    window.stride = window.width;
+    if (!is_rim(f, window))
+        return scene_patch_read(f->dem, growth_of(f), window, out, error);
+    const char *name = f->dem->info.name;
+    const fbm_window wide = scene_cell_store_window(window);
+    const size_t count = window.width * window.height;
+    double *numbers = tl_alloc_grid((int64_t)wide.width, (int64_t)wide.height, sizeof *numbers);
+    *out = (scene_patch){window, tl_alloc(count, sizeof *out->heights), tl_alloc(count, 1)};
+    bool good = numbers && out->heights && out->known, all = true;
+    tl_status status = good ? TL_OK : tl_fail_memory(error, name);
+    if (status == TL_OK)
+        status = scene_cell_store_read(f->rim, wide, make_rim, f, numbers, name, error);
+    const double *from = numbers + (size_t)(window.j - wide.j) * wide.width + (size_t)(window.i - wide.i);
+    for (size_t k = 0; status == TL_OK && k < count; k++) {
+        uint64_t both;
+        memcpy(&both, &from[k / window.width * wide.width + k % window.width], sizeof both);
+        const uint32_t height = (uint32_t)both;
+        memcpy(&out->heights[k], &height, sizeof height);
+        out->known[k] = (unsigned char)(both >> 32);
+        all = all && out->known[k] == SCENE_MODEL;
+    }
+    free(numbers);
+    if (status != TL_OK)
+        scene_patch_free(out);
+    else if (all) {
+        free(out->known);
+        out->known = NULL;
+    }
+    return status;
+}
+
+static tl_status ground_read(const field *f, fbm_window window, scene_ground *g, tl_error *error)
+{
+    *g = (scene_ground){.planes = {.of = {NULL}}};
     fbm_window wide = f->terrain ? scene_widened(window, FBM_ENERGY_MARGIN) : window;
-    tl_status status = scene_patch_read(f->dem, growth, wide, &g->patch, error);
+    tl_status status = recall_patch(f, wide, &g->patch, error);
     return status == TL_OK && f->chain.mapped ? read_planes(f, window, g, error) : status;
 }
 
-static void ground_free(ground *g)
+/* For scene_cell_means_run. */
+static tl_status read_ground(const void *context, fbm_window window, scene_ground *out, tl_error *error)
 {
-    scene_patch_free(&g->patch);
-    for (int p = 0; p < SCENE_PLANES; p++)
-        free(g->planes.of[p]);
+    return ground_read(context, window, out, error);
 }
 
 /* The lattice window, or the window of cells, that a window of samples is. Cell k of an area raster at level l has its
@@ -194,14 +301,13 @@ static tl_status read_means(const field *f, int level, tl_window window, float *
     const char *name = f->dem->info.name;
     fbm_window target = {window.x, window.y, (size_t)window.width, (size_t)window.height, (size_t)stride};
     fbm_window support = scene_cell_means_support(&f->means, &f->chain, level, target);
-    ground g;
+    scene_ground g;
     tl_status status = ground_read(f, support, &g, error);
     if (status == TL_OK)
-        status = scene_cell_means_run(&f->means, &f->chain, level, target, &g.patch, f->chain.mapped ? &g.planes : NULL,
-                                      out, name, error);
+        status = scene_cell_means_run(&f->means, &f->chain, level, target, &g, read_ground, f, out, name, error);
     if (status == TL_OK && g.patch.known)
         cut_voids(&g.patch, true, level, window, out, stride);
-    ground_free(&g);
+    scene_ground_free(&g);
     return status;
 }
 
@@ -214,13 +320,13 @@ static tl_status read_block(const field *f, int level, tl_window window, float *
     scene_chain_target target = target_of(f, level, window, out, stride);
     fbm_window support = scene_chain_support(&f->chain, &target);
     support.stride = support.width;
-    ground g;
+    scene_ground g;
     tl_status status = ground_read(f, support, &g, error);
     if (status == TL_OK)
         status = scene_chain_run(&f->chain, &target, load, &g, f->source.info.name, error);
     if (status == TL_OK && g.patch.known)
         cut_voids(&g.patch, is_area(f), level, window, out, stride);
-    ground_free(&g);
+    scene_ground_free(&g);
     return status;
 }
 
@@ -295,6 +401,10 @@ static void field_destroy(tl_source *self)
     free(f->parameters);
     free(f->terrain);
     scene_chain_finish(&f->chain);
+    scene_cell_means_finish(&f->means);
+    for (int p = 0; p < SCENE_PLANES; p++)
+        scene_cell_store_destroy(f->kept[p]);
+    scene_cell_store_destroy(f->rim);
     free(f);
 }
 
@@ -426,6 +536,10 @@ static tl_status open_maps(field *f, const tl_field_options *o, tl_error *error)
         f->deltas[l] = fbm_exp2(-l * f->hursts[l]);
     }
     f->growth.delta = 1; /* the maps' */
+    for (int p = 0; p < SCENE_PLANES && status == TL_OK; p++) {
+        f->kept[p] = scene_cell_store_create(dem->width);
+        status = f->kept[p] ? TL_OK : tl_fail_memory(error, dem->name);
+    }
     return status == TL_OK && o->hurst_map ? scene_chain_fit_places(&f->chain, dem->name, error) : status;
 }
 
@@ -522,8 +636,8 @@ static tl_status prepare(field *f, const tl_field_options *o, tl_error *error)
         return status;
     place(f, o->levels);
     if (is_area(f) && !terrain && scheme == fbm_schemes && o->levels > 0)
-        status = scene_cell_means_measure(&f->chain, f->dem->info.height / 2, o->levels, &f->means, f->dem->info.name,
-                                          error);
+        status = scene_cell_means_measure(&f->chain, f->dem->info.width, f->dem->info.height / 2, o->levels, &f->means,
+                                          f->dem->info.name, error);
     if (status == TL_OK && terrain && o->levels > 0) {
         f->terrain = malloc(sizeof *f->terrain);
         if (!f->terrain)
@@ -557,8 +671,11 @@ tl_source *tl_field_create(const tl_source *dem, const tl_field_options *options
     f->source.info.parameter_count = 0; /* the record is its own */
     f->source.info.parameters = NULL;
     f->dem = dem;
+    f->rim = scene_cell_store_create(dem->info.width);
     tl_crs_retain(f->source.info.georef.crs);
-    if (prepare(f, o, error) == TL_OK)
+    if (!f->rim)
+        tl_fail_memory(error, dem->info.name);
+    else if (prepare(f, o, error) == TL_OK)
         return &f->source;
     field_destroy(&f->source);
     return NULL;
@@ -604,12 +721,12 @@ static tl_status read_plane(const field *f, int plane, bool is_there, float othe
         out[k] = otherwise;
     if (!is_there)
         return TL_OK;
-    ground g;
+    scene_ground g;
     fbm_window from = {window.x, window.y, (size_t)window.width, (size_t)window.height, (size_t)window.width};
     tl_status status = ground_read(f, from, &g, error);
     if (status == TL_OK)
         memcpy(out, g.planes.of[plane], count * sizeof *out);
-    ground_free(&g);
+    scene_ground_free(&g);
     return status;
 }
 

@@ -201,11 +201,11 @@ typedef struct guess {
 
 typedef struct simulation {
     const scene_growth *growth;
-    int64_t around;                                    /* columns around the globe; 0: it does not wrap */
-    int exponent;                                      /* of the covariance */
-    double covariance[2 * ACROSS - 1][2 * ACROSS - 1]; /* of offsets to 4 columns and rows */
-    guess cache[CACHED];                               /* mask 0: empty */
-    float *delta, *hurst;                              /* by place; or NULL */
+    int64_t around;                    /* columns around the globe; 0: it does not wrap */
+    int exponent;                      /* of the covariance */
+    double covariance[ACROSS][ACROSS]; /* of offsets of 0 ... 4 columns and rows */
+    guess cache[CACHED];               /* mask 0: empty */
+    float *delta, *hurst;              /* by place; or NULL */
 } simulation;
 
 /* Step to neighbour n of 5 x 5. */
@@ -221,9 +221,9 @@ static void set_exponent(simulation *s, int exponent)
     const double nearest = (double)exponent / EXPONENT_STEPS;
     const double hurst = exponent == NO_STEP ? s->growth->hurst : fmin(fmax(nearest, FBM_HURST_MIN), FBM_HURST_MAX);
     s->exponent = exponent;
-    for (int dy = 0; dy < 2 * ACROSS - 1; dy++)
-        for (int dx = 0; dx < 2 * ACROSS - 1; dx++) {
-            double x = dx - 2 * NEAR, y = dy - 2 * NEAR, a = s->growth->aspect;
+    for (int dy = 0; dy < ACROSS; dy++)
+        for (int dx = 0; dx < ACROSS; dx++) {
+            double x = dx, y = dy, a = s->growth->aspect;
             s->covariance[dy][dx] = -.5 * fbm_pow(x * x * a + y * y / a, hurst);
         }
 }
@@ -254,7 +254,7 @@ static void simulation_free(simulation *s)
 
 static double covariance_of(const simulation *s, int dx, int dy)
 {
-    return s->covariance[dy + 2 * NEAR][dx + 2 * NEAR];
+    return s->covariance[dy < 0 ? -dy : dy][dx < 0 ? -dx : dx];
 }
 
 /* The best guess with weights that add up to 1, by elimination; the system is that of the neighbours' covariances, with
