@@ -1,4 +1,5 @@
 #include "cmd/command.h"
+#include "cmd/json_info.h"
 #include "cmd/mesh_info.h"
 
 #include <jansson.h>
@@ -409,15 +410,19 @@ static int run(const command *self, int argc, const char **argv, bool help)
     int status;
     if (!command_begin(self, argc, argv, help, groups, -1, &rest, &status))
         return status;
-    bool mesh = rest.count == 1 && mesh_info_is_for(rest.names[0]);
+    bool tiles = rest.count == 1 && json_info_is_for(rest.names[0]);
+    bool mesh = !tiles && rest.count == 1 && mesh_info_is_for(rest.names[0]);
     if (!set.common.memory && !mesh)
         set.common.memory = MEMORY; /* each block is looked at once or twice, one after the other */
-    status = mesh ? mesh_info_print(rest.names[0], set.json, &set.common) : inform(&set, &rest);
+    status = tiles  ? json_info_print(rest.names[0], set.json)
+             : mesh ? mesh_info_print(rest.names[0], set.json, &set.common)
+                    : inform(&set, &rest);
     arguments_free(&rest);
     return status;
 }
 
-const command command_info = {"info", "tell what a raster or a mesh holds", "RASTER...|MESH [--json]",
+const command command_info = {"info", "tell what a raster or a mesh holds", "RASTER...|MESH|TILES [--json]",
                               INPUT_NOTES "\n\nWithout --memory, info of a raster takes 64 MB. Meshes are .glb, "
-                                          ".obj, .ply and .stl as talus writes them.",
+                                          ".obj, .ply and .stl as talus writes them; points, .geojson and .csv; TILES, "
+                                          "the folders of tiles, a .terrain in one, and what --preset writes.",
                               run};

@@ -1096,8 +1096,9 @@ typedef struct tl_mesh_summary {
     size_t record_count;
 } tl_mesh_summary;
 
-/* Reads a .glb, .obj, .ply or .stl that talus wrote, in memory. TL_ERROR_DATA where it is damaged, or of a kind that
- * talus would not write; TL_ERROR_MEMORY where it takes more than run->memory. */
+/* Reads a .glb, .obj, .ply or .stl that talus wrote, in memory; or points, .geojson or .csv, whose "vertices" they are,
+ * and a .terrain of tl_tiles_make, in degrees where its name has its level, column and row. TL_ERROR_DATA where it is
+ * damaged, or of a kind that talus would not write; TL_ERROR_MEMORY where it takes more than run->memory. */
 TL_API tl_status tl_mesh_read_summary(const char *path, const tl_run *run, tl_mesh_summary *out, tl_error *error);
 /* Writes an error pyramid to `path` as a GeoTIFF of bytes, or of floats where it is exact. */
 TL_API tl_status tl_pyramid_save(const tl_pyramid *pyramid, const char *path, const tl_write_options *options,

@@ -4,6 +4,7 @@
 #include "lib/base/georef.h"
 #include "lib/base/parallel.h"
 #include "lib/base/size.h"
+#include "lib/out/summary_read.h"
 
 #include <jansson.h>
 #include <meshoptimizer.h>
@@ -12,6 +13,7 @@
 #include <math.h>
 #include <stdio.h>
 #include <string.h>
+#include <strings.h>
 #include <sys/stat.h>
 
 enum {
@@ -258,12 +260,16 @@ static tl_status read_stl(bytes *in, out_mesh_file *out, tl_error *error)
     from_text = strstr(head, " ecef from ");
     if (from_text && sscanf(from_text, " ecef from %lf %lf %lf", &origin[0], &origin[1], &origin[2]) != 3)
         return malformed(in, "its header", error);
-    char frame[16], place[80];
+    char version[32], frame[16], place[80];
     tl_status status = TL_OK;
-    if (sscanf(head, "talus %*s %15[a-z]", frame) == 1)
+    if (sscanf(head, "talus %31s", version) == 1)
+        status = note(out, "version", version, error);
+    if (status == TL_OK && sscanf(head, "talus %*s %15[a-z]", frame) == 1)
         status = note(out, "frame", frame, error);
     if (status == TL_OK && sscanf(head, "talus %*s enu at %79[-+.0-9 ]", place) == 1)
         status = note(out, "origin", place, error);
+    if (status == TL_OK)
+        status = note(out, "record", "none: an STL has no room for it; .glb, .ply and .obj have", error);
     if (status != TL_OK)
         return status;
     for (size_t k = 0; k < out->vertex_count; k++) {
@@ -494,8 +500,32 @@ static tl_status fits(const char *path, const tl_run *run, tl_error *error)
     return tl_run_fits(run, 3.5 * (double)status.st_size, path, "reading the mesh", error);
 }
 
+/* Files of other kinds; false: `path` is none. */
+static bool read_other(const char *path, tl_mesh_summary *out, tl_status *status, tl_error *error)
+{
+    static const struct {
+        const char *ending;
+        tl_status (*read)(const char *, tl_mesh_summary *, tl_error *);
+    } readers[] = {{"csv", out_csv_summary}, {"geojson", out_geojson_summary}, {"terrain", out_terrain_summary}};
+    const char *dot = strrchr(path, '.');
+    for (size_t k = 0; dot && k < sizeof readers / sizeof *readers; k++)
+        if (strcasecmp(dot + 1, readers[k].ending) == 0) {
+            *out = (tl_mesh_summary){.record = NULL};
+            *status = readers[k].read(path, out, error);
+            if (*status != TL_OK) {
+                free(out->record);
+                out->record = NULL;
+            }
+            return true;
+        }
+    return false;
+}
+
 tl_status tl_mesh_read_summary(const char *path, const tl_run *run, tl_mesh_summary *out, tl_error *error)
 {
+    tl_status other;
+    if (read_other(path, out, &other, error))
+        return other;
     out_mesh_file file;
     tl_status status = fits(path, run, error);
     if (status == TL_OK)

@@ -9,6 +9,7 @@
 #include "lib/base/size.h"
 #include "lib/out/out.h"
 
+#include <jansson.h>
 #include <stdio.h>
 #include <string.h>
 #include <strings.h>
@@ -188,6 +189,24 @@ static tl_status write_features(json_writer *self, const walked *points, size_t 
     return TL_OK;
 }
 
+/* How the points were made, as a member of the collection; to be freed. */
+static char *describe_record(const tl_framework *framework)
+{
+    tl_parameter *list = NULL;
+    size_t count = 0;
+    char bound[TL_NUMBER_TEXT];
+    tl_number_text(tl_framework_max_error(framework), bound);
+    json_t *record = json_object();
+    bool good = tl_parameters_add_origin(&list, &count, &framework->info, NULL) == TL_OK &&
+                tl_parameters_add(&list, &count, "max_error", bound, NULL) == TL_OK;
+    for (size_t k = 0; good && k < count; k++)
+        json_object_set_new(record, list[k].name, json_string(list[k].value));
+    char *text = good ? json_dumps(record, JSON_COMPACT) : NULL;
+    json_decref(record);
+    free(list);
+    return text;
+}
+
 static tl_status begin_json(json_writer *self, tl_error *error)
 {
     const tl_crs *crs = self->framework->info.georef.crs;
@@ -197,11 +216,17 @@ static tl_status begin_json(json_writer *self, tl_error *error)
         if (*c != '"' && *c != '\\' && (unsigned char)*c >= ' ')
             name[used++] = *c;
     name[used] = '\0';
-    int length =
-        self->lonlat
-            ? snprintf(head, LINE, "{\"type\":\"FeatureCollection\",\"features\":[\n")
-            : snprintf(head, LINE, "{\"type\":\"FeatureCollection\",\"coordinates\":\"%s\",\"features\":[\n", name);
-    return tl_output_append(self->output, head, (size_t)length, error);
+    int length = snprintf(head, LINE,
+                          "{\"type\":\"FeatureCollection\"%s%s%s,\"talus\":", self->lonlat ? "" : ",\"coordinates\":\"",
+                          self->lonlat ? "" : name, self->lonlat ? "" : "\"");
+    char *record = describe_record(self->framework);
+    if (!record)
+        return tl_fail_memory(error, tl_output_path(self->output));
+    tl_status status = tl_output_append(self->output, head, (size_t)length, error);
+    if (status == TL_OK)
+        status = tl_output_append(self->output, record, strlen(record), error);
+    free(record);
+    return status == TL_OK ? tl_output_append(self->output, ",\"features\":[\n", 14, error) : status;
 }
 
 tl_status out_points_geojson(const tl_framework *framework, const tl_source *dem, tl_output *output,

@@ -693,6 +693,48 @@ def tiles_of_nothing_are_refused(case):
     expect(tiles <= most <= tiles + 4, f"{foreseen} {made}")
 
 
+def points_and_tiles_are_read_back(case):
+    """info tells of points, of folders of tiles and what is in them, and of what a preset writes; damage is told."""
+    def about(name, schema):
+        found = json.loads(case.run("info", "--json", name).out)
+        with open(os.path.join(ROOT, "doc", schema), encoding="utf-8") as file:
+            check_schema(found, json.load(file))
+        expect(case.run("info", name).out.startswith(f"{name}\n"), name)
+        return found
+    for ending in ("geojson", "csv"):
+        said = case.run("simplify", EXAMPLE, "-e", 20, "--features", "points", "--points", "-o", f"p.{ending}").err
+        points = about(f"p.{ending}", "mesh_info.schema.json")
+        expect(f"{points['vertices']} points" in said or str(points["vertices"]) in said, said)
+        expect(points["low"][2] >= 200 and "summit" in points["record"]["features"], points)
+        with open(case.path(f"p.{ending}"), "rb") as file:
+            whole = file.read()
+        with open(case.path(f"cut.{ending}"), "wb") as file:
+            file.write(whole[:len(whole) // 2])
+        refused = case.run("info", f"cut.{ending}", status=1).err
+        expect("as talus writes it" in refused, refused)
+    expect(about("p.geojson", "mesh_info.schema.json")["record"]["max_error"] == "20", "the bound")
+    case.run("tiles", EXAMPLE, "-q", "-o", "globe")
+    pyramid = about("globe", "tiles_info.schema.json")
+    names = [os.path.join(where, name) for where, _, files in os.walk(case.path("globe")) for name in files
+             if name.endswith(".terrain")]
+    expect(pyramid["tiles"] == len(names), pyramid)
+    deepest = max(names, key=lambda name: int(name.split("/")[-3]))
+    level, column, row = deepest[:-len(".terrain")].split("/")[-3:]
+    tile = about(f"globe/{level}/{column}/{row}.terrain", "mesh_info.schema.json")
+    expect(tile["record"]["tile"].startswith(f"level {level}, column {column}, row {row} "), tile)
+    expect(abs(tile["low"][0] - (int(column) * 180 / 2 ** int(level) - 180)) < 1e-9 and tile["triangles"] > 0, tile)
+    with open(case.path("torn.terrain"), "wb") as torn, open(deepest, "rb") as file:
+        torn.write(file.read()[:-100])
+    expect("as talus writes it" in case.run("info", "torn.terrain", status=1).err, "a torn tile")
+    case.run("tiles", EXAMPLE, "--format", "3dtiles", "-q", "-o", "city")
+    expect(about("city", "tiles_info.schema.json")["geometric_error"] > 0, "3D Tiles")
+    write_dem(case, width=170, height=160)
+    case.run("synth", "dem.tif", "-l", 1, "--preset", "unity", "--tile", 129, "-q", "-o", "land.r16")
+    tiles = about("land_x1_y0.r16", "tiles_info.schema.json")
+    expect(tiles["tiles"] == 4 and tiles["record"]["command"].startswith("synth --levels 1"), tiles)
+    expect(about("land.json", "tiles_info.schema.json")["preset"] == "unity", "its JSON file")
+
+
 def outputs_are_made_again(case):
     """--same-as gives the same bytes in every format, with files of its options and names with spaces; other options go over it."""
     write_dem(case, "a dem.tif", width=100, height=90)
@@ -724,6 +766,11 @@ def outputs_are_made_again(case):
     write_dem(case, "a dem.tif", width=101, height=90)
     refused = case.run("synth", "--same-as", "a.exr", "-q", "-o", "e.exr", status=1).err
     expect("not kept" in refused, refused)
+    case.run("synth", "a dem.tif", "-l", 1, "--layers", "normal,slope", "-q", "-o", "layered.exr")
+    write_dem(case, "a dem.tif", width=102, height=90)
+    before = set(os.listdir(case.folder))
+    case.run("synth", "--same-as", "layered.exr", "-q", "-o", "e.exr", status=1)
+    expect(set(os.listdir(case.folder)) == before, "layers are left behind")
     expect("was made by talus synth" in case.run("noise", "--same-as", "a.exr", "-o", "f.exr", status=2).err, "the command")
     os.unlink(case.path("a dem.tif"))
     expect("name the input too" in case.run("synth", "--same-as", "a.exr", "-o", "f.exr", status=2).err, "a lost input")
@@ -1335,7 +1382,7 @@ TESTS = [
     bar_only_on_a_terminal, progress_lines_are_json, quiet_is_silent,
     json_keeps_its_schema, reports_keep_their_schema, statistics_keep_their_schema, real_files_keep_the_schema, window_costs_its_blocks, a_part_is_that_part, corners_agree_with_gdal,
     names_of_any_bytes,
-    serves_the_folder_alone, tiles_of_nothing_are_refused, formats_hold_the_same_heights, outputs_are_read_back, sidecars_are_checked, outputs_are_made_again, png_within_half_a_step, point_samples_are_kept, point_samples_of_the_andes_are_kept,
+    serves_the_folder_alone, tiles_of_nothing_are_refused, formats_hold_the_same_heights, outputs_are_read_back, points_and_tiles_are_read_back, sidecars_are_checked, outputs_are_made_again, png_within_half_a_step, point_samples_are_kept, point_samples_of_the_andes_are_kept,
     area_means_stay_on_their_footprint,
     glb_is_in_metres, frames_agree, simplify_keeps_its_word, diagonals_are_turned, codings_keep_the_bound, layers_are_written_beside, inputs_are_not_overwritten, layers_are_refused_before_the_work, vertices_tell_where_they_came_from,
     flights_tell_how_far_ground_jumps, pictures_take_colours_of_rasters,
