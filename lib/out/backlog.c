@@ -66,14 +66,38 @@ static const out_late_tile *take_next(out_backlog *backlog)
     return here ? late : NULL;
 }
 
+/* Takes the tile itself, and gives the buffer of one that was written before for it. */
+static bool swap_tile(out_late_tile *late, void **bytes, size_t count, size_t capacity)
+{
+    void *other = late->capacity == capacity ? late->bytes : malloc(capacity);
+    if (!other)
+        return false;
+    if (late->bytes != other)
+        free(late->bytes);
+    late->bytes = *bytes;
+    late->capacity = capacity;
+    late->count = count;
+    *bytes = other;
+    return true;
+}
+
 tl_status out_backlog_add(out_backlog *backlog, tl_parallel *loop, uint64_t tile, const void *bytes, size_t count,
                           tl_error *error)
 {
+    void *theirs = (void *)bytes; /* left alone where its capacity is 0 */
+    return out_backlog_give(backlog, loop, tile, &theirs, count, 0, error);
+}
+
+tl_status out_backlog_give(out_backlog *backlog, tl_parallel *loop, uint64_t tile, void **buffer, size_t count,
+                           size_t capacity, tl_error *error)
+{
+    const void *bytes = *buffer;
     if (!tl_parallel_wait_near(loop, tile, backlog->room))
         return tl_fail(error, TL_ERROR_CANCELLED, "interrupted");
     if (!begin(backlog, tile, NULL)) {
         out_late_tile *copy = &backlog->late[tile % backlog->room]; /* free, for the tile before there had its turn */
-        tl_status status = copy_tile(copy, bytes, count, error);
+        bool taken = capacity && swap_tile(copy, buffer, count, capacity);
+        tl_status status = taken ? TL_OK : copy_tile(copy, bytes, count, error);
         if (status != TL_OK || !begin(backlog, tile, copy))
             return status;
     }

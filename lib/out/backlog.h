@@ -38,4 +38,9 @@ void out_backlog_restart(out_backlog *backlog);
 tl_status out_backlog_add(out_backlog *backlog, tl_parallel *loop, uint64_t tile, const void *bytes, size_t count,
                           tl_error *error);
 
+/* The same of a buffer of `capacity` bytes from malloc, 0: it is only lent. Where the tile has to wait, *buffer becomes
+ * another of that size. */
+tl_status out_backlog_give(out_backlog *backlog, tl_parallel *loop, uint64_t tile, void **buffer, size_t count,
+                           size_t capacity, tl_error *error);
+
 #endif
