@@ -813,7 +813,7 @@ static void neighboursShareTheirEdgesAndNormals(void **state)
                 close_content(&b);
             }
     }
-    assert_true(pairs > 500 && shared > 10000);
+    assert_true(pairs > 100 && shared > 2 * pairs); /* each has the two ends of an edge, twice */
 }
 
 /* ---- The same bytes ---- */
