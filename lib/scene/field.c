@@ -38,6 +38,7 @@ typedef struct field {
     scene_growth growth;                  /* beyond the rim, but for its rings */
     scene_cell_store *kept[SCENE_PLANES]; /* what maps say of cells; NULL: it is not kept */
     scene_cell_store *rim;                /* patches that reach beyond the model, or have voids */
+    scene_cell_store *energies;           /* of the terrain */
     /* Fields of exponent and delta; without sources where there is no map. */
     scene_field_map maps[SCENE_PLANES];
     double units[UNITS]; /* sigma over delta at exponents 0.01, 0.02 ...; all 1 where the map is of delta */
@@ -194,72 +195,11 @@ static scene_growth growth_of(const field *f)
     return growth;
 }
 
-/* A sample of a patch as a number that is only ever copied. */
-static tl_status make_rim(const void *context, fbm_window window, double *out, tl_error *error)
-{
-    const field *f = context;
-    scene_patch patch;
-    tl_status status = scene_patch_read(f->dem, growth_of(f), window, &patch, error);
-    if (status != TL_OK)
-        return status;
-    for (size_t k = 0; k < window.width * window.height; k++) {
-        uint64_t known = patch.known ? patch.known[k] : SCENE_MODEL;
-        uint32_t height;
-        memcpy(&height, &patch.heights[k], sizeof height);
-        const uint64_t both = known << 32 | height;
-        memcpy(&out[k], &both, sizeof both);
-    }
-    scene_patch_free(&patch);
-    return TL_OK;
-}
-
-/* Whether a patch takes long to make. */
-static bool is_rim(const field *f, fbm_window w)
-{
-    const tl_source_info *dem = &f->dem->info;
-    return dem->has_voids || f->dem->validity || w.j < 0 || w.j + (int64_t)w.height > dem->height ||
-           (!dem->wraps && (w.i < 0 || w.i + (int64_t)w.width > dem->width));
-}
-
-/* The patch of a window; what was made up of it is kept, for the windows beside it need much the same. */
-static tl_status recall_patch(const field *f, fbm_window window, scene_patch *out, tl_error *error)
-{
-    window.stride = window.width;
-    if (!is_rim(f, window))
-        return scene_patch_read(f->dem, growth_of(f), window, out, error);
-    const char *name = f->dem->info.name;
-    const fbm_window wide = scene_cell_store_window(window);
-    const size_t count = window.width * window.height;
-    double *numbers = tl_alloc_grid((int64_t)wide.width, (int64_t)wide.height, sizeof *numbers);
-    *out = (scene_patch){window, tl_alloc(count, sizeof *out->heights), tl_alloc(count, 1)};
-    bool good = numbers && out->heights && out->known, all = true;
-    tl_status status = good ? TL_OK : tl_fail_memory(error, name);
-    if (status == TL_OK)
-        status = scene_cell_store_read(f->rim, wide, make_rim, f, numbers, name, error);
-    const double *from = numbers + (size_t)(window.j - wide.j) * wide.width + (size_t)(window.i - wide.i);
-    for (size_t k = 0; status == TL_OK && k < count; k++) {
-        uint64_t both;
-        memcpy(&both, &from[k / window.width * wide.width + k % window.width], sizeof both);
-        const uint32_t height = (uint32_t)both;
-        memcpy(&out->heights[k], &height, sizeof height);
-        out->known[k] = (unsigned char)(both >> 32);
-        all = all && out->known[k] == SCENE_MODEL;
-    }
-    free(numbers);
-    if (status != TL_OK)
-        scene_patch_free(out);
-    else if (all) {
-        free(out->known);
-        out->known = NULL;
-    }
-    return status;
-}
-
 static tl_status ground_read(const field *f, fbm_window window, scene_ground *g, tl_error *error)
 {
     *g = (scene_ground){.planes = {.of = {NULL}}};
     fbm_window wide = f->terrain ? scene_widened(window, FBM_ENERGY_MARGIN) : window;
-    tl_status status = recall_patch(f, wide, &g->patch, error);
+    tl_status status = scene_patch_recall(f->rim, f->dem, growth_of(f), wide, &g->patch, error);
     return status == TL_OK && f->chain.mapped ? read_planes(f, window, g, error) : status;
 }
 
@@ -405,6 +345,7 @@ static void field_destroy(tl_source *self)
     for (int p = 0; p < SCENE_PLANES; p++)
         scene_cell_store_destroy(f->kept[p]);
     scene_cell_store_destroy(f->rim);
+    scene_cell_store_destroy(f->energies);
     free(f);
 }
 
@@ -646,6 +587,12 @@ static tl_status prepare(field *f, const tl_field_options *o, tl_error *error)
         status = f->chain.mapped ? scene_terrain_measure_strengths(f->dem, &detail, octaves, o->run, f->terrain, error)
                                  : scene_terrain_measure(f->dem, &detail, octaves, o->levels, o->seed, 0, o->run,
                                                          f->terrain, error);
+    }
+    if (status == TL_OK && f->terrain && !f->chain.mapped) {
+        f->energies = scene_cell_store_create(f->dem->info.width);
+        f->terrain->kept_energies = f->energies;
+        f->terrain->kept_patches = f->rim;
+        status = f->energies ? TL_OK : tl_fail_memory(error, f->dem->info.name);
     }
     return status == TL_OK ? note_all(f, o, &measured, error) : status;
 }

@@ -577,3 +577,69 @@ tl_status scene_patch_read(const tl_source *dem, scene_growth growth, fbm_window
     }
     return read_with_rim(dem, growth, w, g, error);
 }
+
+/* ---- Recalling ---- */
+
+typedef struct making {
+    const tl_source *dem;
+    scene_growth growth;
+} making;
+
+/* A sample as a number that is only ever copied: its height, and what is known of it. */
+static tl_status make_packed(const void *context, fbm_window window, double *out, tl_error *error)
+{
+    const making *of = context;
+    scene_patch patch;
+    tl_status status = scene_patch_read(of->dem, of->growth, window, &patch, error);
+    if (status != TL_OK)
+        return status;
+    for (size_t k = 0; k < window.width * window.height; k++) {
+        uint64_t known = patch.known ? patch.known[k] : SCENE_MODEL;
+        uint32_t height;
+        memcpy(&height, &patch.heights[k], sizeof height);
+        const uint64_t both = known << 32 | height;
+        memcpy(&out[k], &both, sizeof both);
+    }
+    scene_patch_free(&patch);
+    return TL_OK;
+}
+
+/* Fills a patch; whether all of it is the model's own. */
+static bool unpack(const double *numbers, fbm_window of, scene_patch *out)
+{
+    const fbm_window w = out->window;
+    const double *from = numbers + (size_t)(w.j - of.j) * of.width + (size_t)(w.i - of.i);
+    bool all = true;
+    for (size_t k = 0; k < w.width * w.height; k++) {
+        uint64_t both;
+        memcpy(&both, &from[k / w.width * of.width + k % w.width], sizeof both);
+        const uint32_t height = (uint32_t)both;
+        memcpy(&out->heights[k], &height, sizeof height);
+        out->known[k] = (unsigned char)(both >> 32);
+        all = all && out->known[k] == SCENE_MODEL;
+    }
+    return all;
+}
+
+tl_status scene_patch_recall(scene_cell_store *kept, const tl_source *dem, scene_growth growth, fbm_window w,
+                             scene_patch *g, tl_error *error)
+{
+    const making of = {dem, growth};
+    w.stride = w.width;
+    if (inside(&dem->info, w) && !dem->info.has_voids && !dem->validity)
+        return scene_patch_read(dem, growth, w, g, error);
+    const fbm_window wide = scene_cell_store_window(w);
+    double *numbers = tl_alloc_grid((int64_t)wide.width, (int64_t)wide.height, sizeof *numbers);
+    *g = (scene_patch){.window = w};
+    tl_status status = numbers ? allocate(g, w, true, dem->info.name, error) : tl_fail_memory(error, dem->info.name);
+    if (status == TL_OK)
+        status = scene_cell_store_read(kept, wide, make_packed, &of, numbers, dem->info.name, error);
+    if (status != TL_OK)
+        scene_patch_free(g);
+    else if (unpack(numbers, wide, g)) {
+        free(g->known);
+        g->known = NULL;
+    }
+    free(numbers);
+    return status;
+}

@@ -3,6 +3,7 @@
 #define SCENE_PATCH_H
 
 #include "fbm/refine.h"
+#include "lib/scene/cell_store.h"
 #include "lib/talus.h"
 
 /* A rectangle of level 0, in samples, that may reach beyond the model. */
@@ -42,6 +43,10 @@ typedef struct scene_growth {
 /* Reads a patch; the result does not depend on where the window lies. Free with scene_patch_free. */
 tl_status scene_patch_read(const tl_source *dem, scene_growth growth, fbm_window window, scene_patch *out,
                            tl_error *error);
+/* The same, what takes long to make being kept: patches that reach beyond the model, or may have voids. `kept` must be
+ * of this model and growth alone. */
+tl_status scene_patch_recall(scene_cell_store *kept, const tl_source *dem, scene_growth growth, fbm_window window,
+                             scene_patch *out, tl_error *error);
 void scene_patch_free(scene_patch *patch);
 
 /* Whether a sample is the model's, filled or not. */

@@ -82,22 +82,74 @@ static void set_slacks(const scene_terrain *t, const scene_patch *patch, fbm_win
         }
 }
 
-/* Level 0 of a window; `patch` holds FBM_ENERGY_MARGIN more. */
+typedef struct making {
+    const scene_terrain *terrain;
+    const tl_source *dem;
+} making;
+
+static tl_status make_energies(const void *context, fbm_window window, double *out, tl_error *error)
+{
+    const making *of = context;
+    const char *name = of->dem->info.name;
+    const size_t count = window.width * window.height;
+    scene_patch patch;
+    tl_status status = scene_patch_recall(of->terrain->kept_patches, of->dem, of->terrain->growth,
+                                          scene_widened(window, FBM_ENERGY_MARGIN), &patch, error);
+    if (status != TL_OK)
+        return status;
+    float *energy = tl_alloc(count, sizeof *energy);
+    status = energy ? patch_energy(of->terrain, &patch, window, energy, name, error) : tl_fail_memory(error, name);
+    for (size_t k = 0; status == TL_OK && k < count; k++)
+        out[k] = (double)energy[k];
+    free(energy);
+    scene_patch_free(&patch);
+    return status;
+}
+
+static tl_status recall_energies(const scene_terrain *t, const tl_source *dem, fbm_window window, float *out,
+                                 tl_error *error)
+{
+    const making of = {t, dem};
+    const fbm_window wide = scene_cell_store_window(window);
+    double *numbers = tl_alloc_grid((int64_t)wide.width, (int64_t)wide.height, sizeof *numbers);
+    if (!numbers)
+        return tl_fail_memory(error, dem->info.name);
+    tl_status status =
+        scene_cell_store_read(t->kept_energies, wide, make_energies, &of, numbers, dem->info.name, error);
+    const double *from = numbers + (size_t)(window.j - wide.j) * wide.width + (size_t)(window.i - wide.i);
+    for (size_t r = 0; status == TL_OK && r < window.height; r++)
+        for (size_t c = 0; c < window.width; c++)
+            out[r * window.width + c] = (float)from[r * wide.width + c];
+    free(numbers);
+    return status;
+}
+
+/* The patch of a window; where nothing is kept, FBM_ENERGY_MARGIN more. */
+static tl_status read_patch(const scene_terrain *t, const tl_source *dem, fbm_window window, scene_patch *out,
+                            tl_error *error)
+{
+    if (t->kept_energies)
+        return scene_patch_recall(t->kept_patches, dem, t->growth, window, out, error);
+    return scene_patch_read(dem, t->growth, scene_widened(window, FBM_ENERGY_MARGIN), out, error);
+}
+
+/* Level 0 of a window. */
 static tl_status layer_read(const scene_terrain *t, const tl_source *dem, fbm_window window, layer *l,
                             scene_patch *patch, tl_error *error)
 {
-    tl_status status = scene_patch_read(dem, t->growth, scene_widened(window, FBM_ENERGY_MARGIN), patch, error);
+    tl_status status = read_patch(t, dem, window, patch, error);
     if (status != TL_OK)
         return status;
     status = layer_init(l, window, dem->info.name, error);
     if (status == TL_OK)
-        status = patch_energy(t, patch, window, l->energy, dem->info.name, error);
+        status = t->kept_energies ? recall_energies(t, dem, window, l->energy, error)
+                                  : patch_energy(t, patch, window, l->energy, dem->info.name, error);
     if (status == TL_OK)
         set_slacks(t, patch, window, l->energy + window.width * window.height);
+    const float *from = patch->heights + (size_t)(window.j - patch->window.j) * patch->window.width +
+                        (size_t)(window.i - patch->window.i);
     for (size_t r = 0; status == TL_OK && r < window.height; r++)
-        memcpy(l->heights + r * window.width,
-               patch->heights + (r + FBM_ENERGY_MARGIN) * patch->window.width + FBM_ENERGY_MARGIN,
-               window.width * sizeof *l->heights);
+        memcpy(l->heights + r * window.width, from + r * patch->window.width, window.width * sizeof *l->heights);
     return status;
 }
 

@@ -25,6 +25,8 @@ typedef struct scene_terrain {
     unsigned without;                 /* parts that are left out: an or of scene_terrain_part */
     scene_growth growth;
     fbm_relief_step steps[SCENE_LEVEL_MAX]; /* steps[l] leads from level l to level l + 1 */
+    /* The caller's, set once all is measured: energies and patches, kept for the windows beside. NULL: not kept. */
+    scene_cell_store *kept_energies, *kept_patches;
 } scene_terrain;
 
 /* Measures a raster, and calibrates its octaves on samples of it so that they get the standard deviations asked for:
