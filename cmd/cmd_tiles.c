@@ -189,7 +189,7 @@ static int run_tiles(const command *self, int argc, const char **argv, bool help
          NULL},
         {"no-normals", 0, OPTION_FLAG, &set.no_normals, NULL, NULL, "leave the vertices' normals away", 0, 0, NULL},
         {"outside", 0, OPTION_NUMBER, &set.outside, NULL, "METRES",
-         "height of ground that the DEM does not know (default: 0)", -1e5, 1e5, NULL},
+         "height of ground that the DEM does not know, of quantized-mesh (default: 0)", -1e5, 1e5, NULL},
         {"attribution", 0, OPTION_TEXT, &set.attribution, NULL, "TEXT", "to be shown with the terrain", 0, 0, NULL},
         {"dry-run", 'n', OPTION_FLAG, &set.dry_run, NULL, NULL, "only tell how many tiles there will be", 0, 0, NULL},
         {0}};
@@ -203,7 +203,7 @@ static int run_tiles(const command *self, int argc, const char **argv, bool help
         {"shard", 0, OPTION_TEXT, &set.shard, NULL, "I/N",
          "make one of N parts, counted from 0, with the others beside it; auto: as Slurm, Open MPI or Kubernetes say",
          0, 0, NULL},
-        {"finish", 0, OPTION_FLAG, &set.finish, NULL, NULL, "after all shards: make the levels above and layer.json", 0,
+        {"finish", 0, OPTION_FLAG, &set.finish, NULL, NULL, "after all shards: make the levels above and the index", 0,
          0, NULL},
         {0}};
     const option input[] = {COMMON_INPUT(set.common), {0}};

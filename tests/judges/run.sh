@@ -35,4 +35,6 @@ TALUS_NPM=$work/npm/node_modules python3 "$here/tests/judges/formats.py" "$progr
 # Pyramids of tiles in parts and after kills: GNU parallel, Open MPI, a Slurm of its own.
 mkdir "$work/tiles"
 python3 "$here/tests/judges/tiles.py" "$program" "$work/tiles" || status=1
+# 3D Tiles, read by a reader of the judge's own and by the glTF validator.
+python3 "$here/tests/judges/tiles3d.py" "$program" "$work/tiles3d" "$work/npm" || status=1
 exit $status

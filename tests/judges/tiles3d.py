@@ -10,7 +10,12 @@ import struct
 import subprocess
 import sys
 
-import numpy as np
+try:
+    import numpy as np
+    from osgeo import gdal, osr
+except ImportError as missing:
+    print(f"skip 3D Tiles: {missing}")
+    sys.exit(0)
 
 PROGRAM, FOLDER = os.path.abspath(sys.argv[1]), os.path.abspath(sys.argv[2])
 NPM = os.path.abspath(sys.argv[3]) if len(sys.argv) > 3 else ""
@@ -252,7 +257,6 @@ def share_edges(name, by_level):
 
 def heights_agree(name, tileset, dem):
     """Posts of the model against the surface of the deepest level."""
-    from osgeo import gdal, osr
     data = gdal.Open(dem)
     t, z = data.GetGeoTransform(), data.ReadAsArray().astype(float)
     nodata = data.GetRasterBand(1).GetNoDataValue()
