@@ -208,8 +208,13 @@ tl_status scene_own_lattice_read(const scene_own_lattice *g, tl_window window, f
     int64_t y0 = tl_int64_max(window.y, 0), y1 = tl_int64_min(window.y + window.height, g->height);
     for (int64_t k = 0; k < window.width * window.height; k++)
         out[k] = NAN;
-    if (x0 >= x1 || y0 >= y1)
+    if (y0 >= y1)
         return TL_OK;
-    return read_inside(g, (tl_window){x0, y0, x1 - x0, y1 - y0}, out + (y0 - window.y) * window.width + (x0 - window.x),
-                       window.width, error);
+    int64_t own = tl_int64_min(x1, g->source->info.width), row = (y0 - window.y) * window.width;
+    tl_status status = TL_OK;
+    if (x0 < own)
+        status = read_inside(g, (tl_window){x0, y0, own - x0, y1 - y0}, out + row + x0 - window.x, window.width, error);
+    if (status == TL_OK && x0 <= own && own < x1) /* the first column once more */
+        status = read_inside(g, (tl_window){0, y0, 1, y1 - y0}, out + row + own - window.x, window.width, error);
+    return status;
 }

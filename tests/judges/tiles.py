@@ -15,6 +15,7 @@ HERE = os.path.dirname(os.path.abspath(__file__))
 EXAMPLES = os.path.join(HERE, "..", "..", "examples")
 DEM = os.path.join(EXAMPLES, "jacksboro.tif")
 WORDS = ["tiles", DEM, "-q", "-l", "11..15", "-e", "2"]  # several blocks, in some seconds
+WORDS_3D = ["tiles", DEM, "-q", "-f", "3dtiles", "-x", "2", "-e", "2", "--layers", "colour"]
 KILLS = 50
 failed = []
 
@@ -46,6 +47,11 @@ def files_are_whole(folder):
                         file.read()
                 except (OSError, EOFError) as error:
                     return f"{path}: {error}"
+            if name.endswith(".glb"):
+                with open(path, "rb") as file:
+                    data = file.read()
+                if int.from_bytes(data[8:12], "little") != len(data):
+                    return f"{path}: {len(data)} bytes"
     return ""
 
 
@@ -54,21 +60,21 @@ def run(*words, **options):
                           check=False, **options)
 
 
-def kills(whole, seconds):
+def kills(whole, seconds, words, wanted):
     """Kills a run at a random moment, looks for torn files, and goes on; the next run ends it."""
     folder = os.path.join(FOLDER, "killed")
     dice = random.Random(8)
     torn, killed, different = "", 0, 0
-    while killed < KILLS:
+    while killed < wanted:
         shutil.rmtree(folder, ignore_errors=True)
         for _ in range(5):  # now and then a run that goes on is killed too
-            process = subprocess.Popen([PROGRAM, *WORDS, "--resume", "-o", folder], stderr=subprocess.DEVNULL)
+            process = subprocess.Popen([PROGRAM, *words, "--resume", "-o", folder], stderr=subprocess.DEVNULL)
             time.sleep(dice.random() * seconds)
             process.send_signal(signal.SIGKILL)
             process.wait()
             killed += process.returncode == -signal.SIGKILL
             torn = torn or files_are_whole(folder)
-        run(PROGRAM, *WORDS, "--resume", "-o", folder)
+        run(PROGRAM, *words, "--resume", "-o", folder)
         different += tree(folder) != whole
     check(f"{killed} kills leave no torn file", not torn, torn)
     check(f"after {killed} kills the tree is the same", not different, f"{different} trees differ")
@@ -215,7 +221,12 @@ def main():
     if not only or "slurm" in only:
         slurm(whole)
     if not only or "kills" in only:
-        kills(whole, 1.1 * seconds)
+        kills(whole, 1.1 * seconds, WORDS, KILLS)
+    if not only or "kills3d" in only:
+        started = time.monotonic()
+        made = run(PROGRAM, *WORDS_3D, "-o", folder + "3d")
+        check("3D Tiles of the example", made.returncode == 0, made.stdout)
+        kills(tree(folder + "3d"), 1.1 * (time.monotonic() - started), WORDS_3D, KILLS // 2)
 
 
 main()
