@@ -1,10 +1,18 @@
 #include "cmd/command.h"
+#include "cmd/height_tiles.h"
 
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
-static const char *const formats[] = {[TL_TILES_QUANTIZED_MESH] = "quantized-mesh", [TL_TILES_3D] = "3dtiles", NULL};
+static const char *const formats[] = {[TL_TILES_QUANTIZED_MESH] = "quantized-mesh",
+                                      [TL_TILES_3D] = "3dtiles",
+                                      /* of heights */ "exr",
+                                      "tif",
+                                      "png",
+                                      "r16",
+                                      "raw",
+                                      NULL};
 
 enum { CODING_QUANTIZED, CODING_COMPRESSED };
 static const char *const codings[] = {[CODING_QUANTIZED] = "quantized", [CODING_COMPRESSED] = "compressed", NULL};
@@ -18,7 +26,13 @@ typedef struct settings {
     bool no_normals, resume, finish, dry_run;
     double outside;
     tl_field_options field;
+    height_tiles heights;
 } settings;
+
+static bool are_heights(const settings *set)
+{
+    return set->format > TL_TILES_3D;
+}
 
 /* "A..B"; false, told. */
 static bool read_levels(const char *text, tl_tiles_options *out)
@@ -140,7 +154,12 @@ static int make_tiles(const settings *set, const arguments *inputs, tl_tiles_opt
     int status = EXIT_DONE;
     if (source)
         progress_stage(&bar, "tiles");
-    if (!source || tl_write_terrain_tiles(source, set->common.output, options, &made, &error) != TL_OK)
+    if (source && are_heights(set)) {
+        if (height_tiles_make(&set->heights, &set->common, formats[set->format], source, &run, &error) == TL_OK)
+            progress_end(&bar);
+        else
+            status = command_failed(&bar, &error);
+    } else if (!source || tl_write_terrain_tiles(source, set->common.output, options, &made, &error) != TL_OK)
         status = command_failed(&bar, &error);
     else
         report(set, &made, progress_end(&bar));
@@ -155,6 +174,18 @@ static bool output_ok(const settings *set)
         return true;
     complain("no folder named; give -o FOLDER");
     return false;
+}
+
+/* What is for meshes only. */
+static bool heights_ok(const settings *set)
+{
+    const char *other = set->max_error > 0 ? "error"
+                        : set->no_normals  ? "no-normals"
+                        : set->attribution ? "attribution"
+                                           : NULL;
+    if (are_heights(set) && other)
+        complain("--%s is for --format quantized-mesh and 3dtiles", other);
+    return !are_heights(set) || !other;
 }
 
 static bool format_ok(const settings *set)
@@ -193,6 +224,7 @@ static int run_tiles(const command *self, int argc, const char **argv, bool help
         {"attribution", 0, OPTION_TEXT, &set.attribution, NULL, "TEXT", "to be shown with the terrain", 0, 0, NULL},
         {"dry-run", 'n', OPTION_FLAG, &set.dry_run, NULL, NULL, "only tell how many tiles there will be", 0, 0, NULL},
         {0}};
+    const option heights[] = {HEIGHT_TILE_OPTIONS(set.heights), {0}};
     const option detail[] = {{"extra-levels", 'x', OPTION_INTEGER, &set.extra, NULL, "N",
                               "levels finer than the DEM, with fractal detail, 0...10 (default: 0)", 0, 10, NULL},
                              FRACTAL_OPTIONS(set.seed, set.field),
@@ -208,8 +240,13 @@ static int run_tiles(const command *self, int argc, const char **argv, bool help
         {0}};
     const option input[] = {COMMON_INPUT(set.common), {0}};
     const option running[] = {COMMON_RUNNING(set.common), {0}};
-    const option_group groups[] = {{"Tiles", tiles}, {"Detail", detail},   {"In parts", parts},
-                                   {"Input", input}, {"Running", running}, {0}};
+    const option_group groups[] = {{"Tiles", tiles},
+                                   {"Of heights", heights},
+                                   {"Detail", detail},
+                                   {"In parts", parts},
+                                   {"Input", input},
+                                   {"Running", running},
+                                   {0}};
     arguments rest;
     int status;
     if (!command_begin(self, argc, argv, help, groups, -1, &rest, &status))
@@ -224,7 +261,8 @@ static int run_tiles(const command *self, int argc, const char **argv, bool help
                                 .finish = set.finish,
                                 .dry_run = set.dry_run};
     bool good = output_ok(&set) && format_ok(&set) && read_levels(set.levels, &options) &&
-                read_shard(set.shard, &options) &&
+                read_shard(set.shard, &options) && heights_ok(&set) &&
+                height_tiles_ok(&set.heights, formats[set.format], &options) &&
                 (!set.layers || command_texture_names(set.layers, &options.textures));
     status = good ? make_tiles(&set, &rest, &options) : EXIT_USAGE;
     arguments_free(&rest);

@@ -1273,6 +1273,58 @@ typedef struct tl_tiles_report {
 TL_API tl_status tl_write_terrain_tiles(const tl_source *source, const char *folder, const tl_tiles_options *options,
                                         tl_tiles_report *out, tl_error *error);
 
+/* ---- Tiles of heights ------------------------------------------------------------------------------ */
+
+typedef enum tl_grid_tiles_format {
+    TL_GRID_TILES_EXR = 0,
+    TL_GRID_TILES_TIFF,
+    TL_GRID_TILES_PNG16, /* 16 bits over one range of heights for all tiles, 0 where it is void */
+    TL_GRID_TILES_R16,   /* the same without a header, the low byte first */
+    TL_GRID_TILES_RAW,   /* floats, the low byte first */
+} tl_grid_tiles_format;
+
+enum { TL_GRID_TILES_LEVELS = 40 };
+
+typedef struct tl_grid_tiles_options {
+    tl_grid_tiles_format format;
+    int64_t tile; /* samples on a side, odd: neighbours share their outermost ones; 0: 257 */
+    /* Level 0 is one tile, and each has twice the samples a side of the one above it, the last those of the source. */
+    bool levels_given;
+    int first_level, last_level;
+    bool range_given; /* of 16-bit heights, in the source's unit; else it is measured, which reads the source once more
+                       */
+    double low, high;
+    tl_compression compression; /* EXR and GeoTIFF */
+    bool resume;                /* these four as in tl_tiles_options */
+    unsigned shard, shards;
+    bool finish;
+    bool dry_run;
+    const tl_run *run;
+} tl_grid_tiles_options;
+
+typedef struct tl_grid_tiles_level {
+    int64_t width, height; /* samples */
+    int64_t columns, rows; /* of tiles, void ones among them */
+    uint64_t tiles, bytes; /* that are there */
+} tl_grid_tiles_level;
+
+typedef struct tl_grid_tiles_report {
+    int level_count, first_level, last_level;
+    tl_grid_tiles_level levels[TL_GRID_TILES_LEVELS];
+    float low, high;      /* of all tiles; NaN: none has heights */
+    uint64_t done_before; /* runs of tiles that an earlier call had made */
+    bool complete;        /* index.json is there */
+} tl_grid_tiles_report;
+
+/* Cuts a source into square tiles of heights of all its levels: FOLDER/LEVEL/COLUMN_ROW.ENDING, columns from the west
+ * and rows from the north, and FOLDER/index.json, which tells their places, range and meaning. All are whole: beyond
+ * the source's rim they are void, and those that are void altogether are left out. Levels of a raster of points are its
+ * every second, fourth ... sample; those of an area raster means over the larger cells. A file appears when it is
+ * complete; equal options and sources give equal files, for any threads and shards. Takes some 16 bytes a sample of a
+ * tile for each worker. TL_ERROR_DATA where heights are beyond the range given. */
+TL_API tl_status tl_write_grid_tiles(const tl_source *source, const char *folder, const tl_grid_tiles_options *options,
+                                     tl_grid_tiles_report *out, tl_error *error);
+
 /* ---- Pictures ---------------------------------------------------------------------------------- */
 
 typedef struct tl_preview_options {

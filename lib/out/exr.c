@@ -217,12 +217,16 @@ static exr_result_t go_on(exr_encode_pipeline_t *pipeline)
 static exr_result_t keep_chunk(exr_encode_pipeline_t *pipeline)
 {
     worker *self = pipeline->encoding_user_data;
-    /* what is not compressed lies in a buffer from malloc that may change places with another */
-    bool plain = pipeline->compressed_buffer == pipeline->packed_buffer;
-    void *buffer = pipeline->compressed_buffer;
-    self->status = out_backlog_give(self->backlog, self->loop, self->tile, &buffer, pipeline->compressed_bytes,
+    /* Readers take a chunk of the unpacked size for one that is not compressed; OpenEXR 3.1 makes compressed ones that
+     * happen to be as large. What is not compressed lies in a buffer from malloc that may change places with another. */
+    bool plain = pipeline->compressed_bytes >= pipeline->packed_bytes,
+         one = pipeline->compressed_buffer == pipeline->packed_buffer;
+    void *buffer = plain ? pipeline->packed_buffer : pipeline->compressed_buffer;
+    self->status = out_backlog_give(self->backlog, self->loop, self->tile, &buffer,
+                                    plain ? pipeline->packed_bytes : pipeline->compressed_bytes,
                                     plain ? pipeline->packed_alloc_size : 0, self->error);
-    pipeline->compressed_buffer = buffer;
+    if (!plain || one)
+        pipeline->compressed_buffer = buffer;
     if (plain)
         pipeline->packed_buffer = buffer;
     return self->status == TL_OK ? EXR_ERR_SUCCESS : EXR_ERR_INCORRECT_CHUNK;
