@@ -218,7 +218,8 @@ static exr_result_t keep_chunk(exr_encode_pipeline_t *pipeline)
 {
     worker *self = pipeline->encoding_user_data;
     /* Readers take a chunk of the unpacked size for one that is not compressed; OpenEXR 3.1 makes compressed ones that
-     * happen to be as large. What is not compressed lies in a buffer from malloc that may change places with another. */
+     * happen to be as large. What is not compressed lies in a buffer from malloc that may change places with another.
+     */
     bool plain = pipeline->compressed_bytes >= pipeline->packed_bytes,
          one = pipeline->compressed_buffer == pipeline->packed_buffer;
     void *buffer = plain ? pipeline->packed_buffer : pipeline->compressed_buffer;
