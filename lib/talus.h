@@ -1050,9 +1050,9 @@ typedef struct tl_write_options {
      * there as a morph target, "parent". */
     bool parent_heights;
     /* GLB: the source over whose finest lattice the mesh lies. Vertices have its normals, turned into the frame: of
-     * samples of its finest level or, of a field of point samples, of the level whose spacing is the vertex's shortest
-     * edge; by central differences, one-sided at the rim and beside voids. NULL: normals are those of the mesh's own
-     * triangles, weighted by their areas. */
+     * slopes of its finest level, meant over a square as wide as the vertex's shortest edge (128 samples at most), or,
+     * of a field of point samples, of the level whose spacing is that edge; by central differences, one-sided at the
+     * rim and beside voids. NULL: normals are those of the mesh's own triangles, weighted by their areas. */
     const tl_source *ground;
     /* GLB: textures of `ground`: tl_texture values, added. Texels are samples of its finest level that has at most
      * texture_size (0: 4096) a side, a PNG each. With TL_TEXTURE_NORMAL the vertices' own normals point up and tangents

@@ -634,6 +634,66 @@ static void fieldsHaveTheNormalsOfTheirLevels(void **state)
     tl_source_destroy(field);
 }
 
+/* The mean slopes of the bilinear surface over the cells within `reach` of a sample. */
+static void slopes_of_cells(const bench *b, int i, int j, int reach, double slopes[2])
+{
+    slopes[0] = slopes[1] = 0;
+    for (int y = j - reach; y < j + reach; y++)
+        for (int x = i - reach; x < i + reach; x++) {
+            const float *z = b->heights + y * WIDTH + x;
+            slopes[0] += ((double)z[1] - (double)z[0] + (double)z[WIDTH + 1] - (double)z[WIDTH]) / 2;
+            slopes[1] += ((double)z[WIDTH] - (double)z[0] + (double)z[WIDTH + 1] - (double)z[1]) / 2;
+        }
+    for (int a = 0; a < 2; a++)
+        slopes[a] /= 4 * reach * reach;
+}
+
+/* Where the shortest edge is 4, 8 or 16 samples, slopes are meant over a square of that size; nearer to the rim over as
+ * large a one as there is. */
+static void normalsAreMeansOverTheShortestEdge(void **state)
+{
+    bench *b = *state;
+    uint32_t random = 1, corners[3] = {0, 2, 1};
+    for (int k = 0; k < WIDTH * HEIGHT; k++) {
+        random = random * 1664525 + 1013904223;
+        b->heights[k] = (float)(300 + 5 * (k % WIDTH) + (random >> 24) / 4.0);
+    }
+    tl_vertex vertices[3];
+    tl_mesh mesh = {.vertices = vertices,
+                    .vertex_count = 3,
+                    .indices = corners,
+                    .triangle_count = 1,
+                    .georef = b->source->info.georef};
+    for (int near = 0; near < 2; near++)
+        for (int edge = 4; edge <= 16; edge *= 2) {
+            const int x = near ? 1 : 20, y = 17, reach = near ? 1 : edge / 2;
+            for (int v = 0; v < 3; v++) /* a longer edge along rows, and a vertex whose square is not the first's */
+                vertices[v] = (tl_vertex){x + (v == 1) * (edge + 1), y + (v == 2) * edge, 300};
+            tl_error error;
+            if (tl_write_mesh(&mesh, b->path, &(tl_write_options){.overwrite = true, .ground = b->source}, &error) !=
+                TL_OK)
+                fail_msg("%s", error.text);
+            glb g = read_glb(b->path);
+            double slopes[2], n[3];
+            slopes_of_cells(b, x, y, reach, slopes);
+            if (reach == 1) /* over one sample to each side it is that through the sample itself */
+                for (int a = 0; a < 2; a++) {
+                    const float *z = b->heights + y * WIDTH + x;
+                    slopes[a] = (double)(z[a ? WIDTH : 1] - z[a ? -WIDTH : -1]) / 2;
+                }
+            double one = sqrt(1 + pow(slopes[0] / 30, 2) + pow(slopes[1] / 30, 2));
+            const double wanted[3] = {-slopes[0] / 30 / one, 1 / one, -slopes[1] / 30 / one};
+            for (size_t k = 0; k < 3; k++) {
+                int i, j;
+                sample_of(b, &g, k, &i, &j);
+                normal_of(&g, k, n);
+                if (i == x && j == y)
+                    assert_normal(n, wanted, 2e-7);
+            }
+            close_glb(&g);
+        }
+}
+
 /* A floor looks down; a skirt is lit as the rim that it hangs from. */
 static void whatHangsBelowIsNoGround(void **state)
 {
@@ -685,6 +745,7 @@ int main(void)
         cmocka_unit_test_setup_teardown(planesAreEvenBesideVoids, setUp, tearDown),
         cmocka_unit_test_setup_teardown(normalsStandOnTheEllipsoid, setUp, tearDown),
         cmocka_unit_test_setup_teardown(fieldsHaveTheNormalsOfTheirLevels, setUp, tearDown),
+        cmocka_unit_test_setup_teardown(normalsAreMeansOverTheShortestEdge, setUp, tearDown),
         cmocka_unit_test_setup_teardown(whatHangsBelowIsNoGround, setUp, tearDown),
         cmocka_unit_test_setup_teardown(othersGroundIsRefused, setUp, tearDown),
         cmocka_unit_test_setup_teardown(whatHasNoMetresHasNoNormals, setUp, tearDown),

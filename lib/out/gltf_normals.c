@@ -175,7 +175,11 @@ static bool normal_at(const gltf_directions *directions, const tl_vertex *v, con
 
 /* ---- The ground's levels ---- */
 
-enum { STEPS = 31, BLOCK_LOG = 8 /* of the samples that are read at once, at most, beside those around */ };
+enum {
+    STEPS = 31,
+    BLOCK_LOG = 8, /* of the samples that are read at once, at most, beside those around */
+    SQUARE_LOG = 6 /* of the largest square over which slopes are meant, on a side, halved: 4 blocks are read for one */
+};
 
 /* Heights at every 2^k-th sample of the lattice. */
 typedef struct grid {
@@ -190,8 +194,9 @@ typedef struct job {
     const tl_source *ground;
     const gltf_directions *directions;
     bool has_base;
-    grid grids[STEPS]; /* by the logarithm of their step */
-    unsigned char *steps;
+    bool nests;              /* each vertex has a grid; else all have the finest, and slopes are meant over squares */
+    grid grids[STEPS];       /* by the logarithm of their step */
+    unsigned char *steps;    /* logarithms of the vertices' shortest edges */
     uint32_t *order, *spare; /* vertices, block by block */
     uint32_t *first;         /* in `order`, of each block that has any, and the end */
     size_t blocks;
@@ -208,8 +213,7 @@ static int find_grids(job *self)
         g->level = self->ground->info.level - step;
         g->from = model && g->level < 0 ? model : self->ground;
         g->means = g->level < 0 && g->from->info.type == TL_RASTER_AREA;
-        if ((step && !scene_field_nests(self->ground)) ||
-            tl_source_size(g->from, g->level, &g->width, &g->height, NULL) != TL_OK)
+        if ((step && !self->nests) || tl_source_size(g->from, g->level, &g->width, &g->height, NULL) != TL_OK)
             return step;
     }
     return STEPS;
@@ -229,15 +233,16 @@ static void note_edge(job *self, uint32_t a, uint32_t b)
     self->steps[b] = self->steps[b] < step ? self->steps[b] : step;
 }
 
-/* The grid of each vertex: that with the step of its shortest edge, on which it lies. */
-static void choose_grids(job *self, int grids)
+/* The step of each vertex's shortest edge: that of its grid, on which it lies, or of its square. */
+static void choose_steps(job *self)
 {
     const tl_mesh *mesh = self->mesh;
-    memset(self->steps, grids - 1, mesh->vertex_count);
-    for (size_t t = 0; grids > 1 && t < mesh->triangle_count; t++)
+    int grids = find_grids(self);
+    memset(self->steps, self->nests ? grids - 1 : SQUARE_LOG + 1, mesh->vertex_count);
+    for (size_t t = 0; t < mesh->triangle_count; t++)
         for (size_t k = 0; k < 3; k++)
             note_edge(self, mesh->indices[3 * t + k], mesh->indices[3 * t + (k + 1) % 3]);
-    for (size_t k = 0; k < mesh->vertex_count; k++) {
+    for (size_t k = 0; self->nests && k < mesh->vertex_count; k++) {
         int64_t both = (int64_t)mesh->vertices[k].i | mesh->vertices[k].j;
         while (both & ((INT64_C(1) << self->steps[k]) - 1))
             self->steps[k]--;
@@ -259,11 +264,17 @@ static tl_status check_place(const job *self, tl_error *error)
 
 /* ---- Blocks ---- */
 
+/* The logarithm of the step of a vertex's grid. */
+static int grid_of(const job *self, uint32_t vertex)
+{
+    return self->nests ? self->steps[vertex] : 0;
+}
+
 /* Where a vertex lies in its grid: column and row of its block, and the grid's step. */
 static uint32_t digit(const job *self, uint32_t vertex, int which)
 {
     const tl_vertex *v = &self->mesh->vertices[vertex];
-    int step = self->steps[vertex];
+    int step = grid_of(self, vertex);
     return which == 2 ? (uint32_t)step : (uint32_t)((which ? v->j : v->i) >> step >> BLOCK_LOG);
 }
 
@@ -343,6 +354,28 @@ static double slope_of_means(double a, double b, double c, double d)
     return 0.5 * (one + other);
 }
 
+/* How far a square around a sample may reach, to all sides alike, without leaving the grid; 0: it is on the rim. */
+static int64_t reach_of(const job *self, const grid *g, uint32_t vertex)
+{
+    const tl_vertex *v = &self->mesh->vertices[vertex];
+    int64_t reach = self->nests || !self->steps[vertex] ? 1 : INT64_C(1) << (self->steps[vertex] - 1);
+    reach = tl_int64_min(reach, tl_int64_min(v->i, g->width - 1 - v->i));
+    return tl_int64_min(reach, tl_int64_min(v->j, g->height - 1 - v->j));
+}
+
+/* The mean slopes over a square: by the differences of its opposite sides, whose ends count half. NaN beside voids. */
+static void slopes_over(const patch *p, int64_t x, int64_t y, int64_t reach, double slopes[2])
+{
+    slopes[0] = slopes[1] = 0;
+    for (int64_t k = -reach; k <= reach; k++) {
+        double share = k == -reach || k == reach ? 0.5 : 1;
+        slopes[0] += share * (height_at(p, x + reach, y + k) - height_at(p, x - reach, y + k));
+        slopes[1] += share * (height_at(p, x + k, y + reach) - height_at(p, x + k, y - reach));
+    }
+    for (int a = 0; a < 2; a++)
+        slopes[a] /= (double)(4 * reach * reach);
+}
+
 /* Units of height by a column and by a row of the grid. */
 static void slopes_at(const grid *g, const patch *p, int64_t x, int64_t y, double slopes[2])
 {
@@ -364,13 +397,14 @@ static tl_status read_patch(const job *self, size_t block, const grid *g, int st
     for (size_t k = self->first[block]; k < self->first[block + 1]; k++) {
         const tl_vertex *v = &self->mesh->vertices[self->order[k]];
         const int64_t at[2] = {v->i >> step, v->j >> step};
+        int64_t reach = self->nests ? 1 : tl_int64_max(reach_of(self, g, self->order[k]), 1);
         for (int a = 0; a < 2; a++) {
-            low[a] = tl_int64_min(low[a], at[a]);
-            high[a] = tl_int64_max(high[a], at[a]);
+            low[a] = tl_int64_min(low[a], at[a] - reach);
+            high[a] = tl_int64_max(high[a], at[a] + reach);
         }
     }
-    int64_t x = tl_int64_max(low[0] - 1, 0), y = tl_int64_max(low[1] - 1, 0);
-    p->window = (tl_window){x, y, tl_int64_min(high[0] + 2, g->width) - x, tl_int64_min(high[1] + 2, g->height) - y};
+    int64_t x = tl_int64_max(low[0], 0), y = tl_int64_max(low[1], 0);
+    p->window = (tl_window){x, y, tl_int64_min(high[0] + 1, g->width) - x, tl_int64_min(high[1] + 1, g->height) - y};
     p->heights = tl_alloc_grid(p->window.width, p->window.height, sizeof *p->heights);
     return p->heights ? tl_source_read(g->from, g->level, p->window, p->heights, error)
                       : tl_fail_memory(error, self->ground->info.name);
@@ -379,11 +413,17 @@ static tl_status read_patch(const job *self, size_t block, const grid *g, int st
 static void add_normal(const job *self, const grid *g, const patch *p, uint32_t vertex)
 {
     const tl_vertex *v = &self->mesh->vertices[vertex];
-    int step = self->steps[vertex];
-    double here = height_at(p, v->i >> step, v->j >> step), slopes[2];
+    int step = grid_of(self, vertex);
+    double here = height_at(p, v->i >> step, v->j >> step), slopes[2] = {(double)NAN, (double)NAN};
     if (isnan(here) || (self->has_base && (double)v->z < here))
         return;
-    slopes_at(g, p, v->i >> step, v->j >> step, slopes);
+    for (int64_t reach = self->nests ? 1 : reach_of(self, g, vertex); reach > 1; reach /= 2) {
+        slopes_over(p, v->i, v->j, reach, slopes);
+        if (!isnan(slopes[0]) && !isnan(slopes[1]))
+            break;
+    }
+    if (isnan(slopes[0]) || isnan(slopes[1]))
+        slopes_at(g, p, v->i >> step, v->j >> step, slopes);
     for (int a = 0; a < 2; a++)
         slopes[a] = ldexp(slopes[a], -step);
     float normal[3];
@@ -394,7 +434,7 @@ static void add_normal(const job *self, const grid *g, const patch *p, uint32_t 
 static tl_status add_block(void *context, tl_parallel *loop, uint64_t block, unsigned worker, tl_error *error)
 {
     const job *self = context;
-    int step = self->steps[self->order[self->first[block]]];
+    int step = grid_of(self, self->order[self->first[block]]);
     const grid *g = &self->grids[step];
     patch p = {.heights = NULL};
     (void)loop;
@@ -421,6 +461,7 @@ tl_status gltf_ground_normals(const tl_mesh *mesh, const tl_source *ground, cons
     tl_run quiet = run ? *run : (tl_run){0};
     quiet.progress = NULL;
     self.has_base = has_base(mesh);
+    self.nests = scene_field_nests(ground);
     tl_status status = check_place(&self, error);
     if (status != TL_OK)
         return status;
@@ -429,7 +470,7 @@ tl_status gltf_ground_normals(const tl_mesh *mesh, const tl_source *ground, cons
     self.spare = tl_alloc(mesh->vertex_count, sizeof *self.spare);
     bool good = self.steps && self.order && self.spare;
     if (good)
-        choose_grids(&self, find_grids(&self));
+        choose_steps(&self);
     good = good && find_blocks(&self);
     status = good ? tl_parallel_for(&quiet, self.blocks, mesh->vertex_count, add_block, &self, error)
                   : tl_fail_memory(error, ground->info.name);

@@ -27,7 +27,9 @@ void gltf_scale_to_one(double v[3]);
 /* Writes the normal of vertex k to normals[k * stride] and on. Slopes are those of layers (lib/scene/layers.h): central
  * differences of samples of `ground`, over whose finest lattice the mesh lies; one-sided at the rim and beside voids.
  * Of a field whose levels nest they are those of its level whose spacing is the vertex's shortest edge: of a view's
- * mesh, the level that was chosen there. Of other sources they are those of the finest level. Left as they are: normals
+ * mesh, the level that was chosen there. Of other sources they are meant over a square as wide as the power of two
+ * samples below that edge, up to 128, or as fits between rims and voids: those of single samples would be speckles on
+ * large triangles. Left as they are: normals
  * of vertices over voids, of those below the ground in a mesh with a base, and where there are no directions. */
 tl_status gltf_ground_normals(const tl_mesh *mesh, const tl_source *ground, const gltf_directions *directions,
                               const tl_run *run, float *normals, size_t stride, tl_error *error);
