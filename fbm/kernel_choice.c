@@ -1,18 +1,20 @@
-/* Which kernels this processor runs, found once. (AVX-512 was measured: no faster than AVX2 for a level.) */
+/* Which kernels this processor runs, found once. */
 #include "fbm/kernel.h"
 #include "fbm/relief_kernel.h"
 
 #include <stdatomic.h>
+#include <stdbool.h>
 
 extern const fbm_kernel fbm_kernel_plain;
 extern const fbm_relief_kernel fbm_relief_kernel_plain;
 #ifdef FBM_HAVE_AVX2
-extern const fbm_kernel fbm_kernel_avx2;
-extern const fbm_relief_kernel fbm_relief_kernel_avx2;
+extern const fbm_kernel fbm_kernel_avx512, fbm_kernel_avx2;
+extern const fbm_relief_kernel fbm_relief_kernel_avx512, fbm_relief_kernel_avx2;
 #endif
 
 static const fbm_kernel *const all[] = {
 #ifdef FBM_HAVE_AVX2
+    &fbm_kernel_avx512,
     &fbm_kernel_avx2,
 #endif
     &fbm_kernel_plain,
@@ -21,6 +23,7 @@ static const fbm_kernel *const all[] = {
 
 static const fbm_relief_kernel *const all_terrain[] = {
 #ifdef FBM_HAVE_AVX2
+    &fbm_relief_kernel_avx512,
     &fbm_relief_kernel_avx2,
 #endif
     &fbm_relief_kernel_plain,
@@ -32,8 +35,9 @@ static size_t find_best(void)
 {
     size_t best = 0;
 #ifdef FBM_HAVE_AVX2
-    if (!__builtin_cpu_supports("avx2"))
-        best++;
+    bool wide = __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512vl") &&
+                __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512bw");
+    best = __builtin_cpu_supports("avx2") ? !wide : 2;
 #endif
     return best;
 }
