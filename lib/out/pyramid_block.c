@@ -51,13 +51,40 @@ static float mean_around(const float *z, int x, int y)
     return count ? (float)(sum / count) : NAN;
 }
 
+/* Where the known heights of a row lie; first > last: nowhere. */
+typedef struct reach {
+    int first, last;
+} reach;
+
+static reach reach_of(const float *z, int y)
+{
+    const float *row = z + (size_t)y * WIDE;
+    reach out = {0, WIDE - 1};
+    while (out.first < WIDE && !isfinite(row[out.first]))
+        out.first++;
+    while (out.last > out.first && !isfinite(row[out.last]))
+        out.last--;
+    return out.first < WIDE ? out : (reach){WIDE, -2};
+}
+
+static reach join(reach a, reach b)
+{
+    return (reach){a.first < b.first ? a.first : b.first, a.last > b.last ? a.last : b.last};
+}
+
 /* One vertex outwards. `rows` has room for two rows, those as they were. */
 static void grow(float *z, float *rows)
 {
     float *fresh = rows, *last = rows + WIDE;
     for (int y = 0; y < WIDE; y++) {
-        for (int x = 0; x < WIDE; x++)
-            fresh[x] = isfinite(z[y * WIDE + x]) ? z[y * WIDE + x] : mean_around(z, x, y);
+        reach near = reach_of(z, y);
+        for (int k = -1; k <= 1; k += 2)
+            if (y + k >= 0 && y + k < WIDE)
+                near = join(near, reach_of(z, y + k));
+        memcpy(fresh, z + (size_t)y * WIDE, WIDE * sizeof *z);
+        for (int x = near.first > 0 ? near.first - 1 : 0; x <= near.last + 1 && x < WIDE; x++)
+            if (!isfinite(fresh[x]))
+                fresh[x] = mean_around(z, x, y);
         /* the row before is not looked at any more */
         if (y)
             memcpy(z + (size_t)(y - 1) * WIDE, last, WIDE * sizeof *z);
