@@ -9,6 +9,8 @@
 #include "lib/out/gltf_normals.h"
 #include "lib/out/out.h"
 #include "lib/out/texture.h"
+#include "lib/out/texture_tiles.h"
+#include "lib/scene/field.h"
 
 #include <jansson.h>
 #include <meshoptimizer.h>
@@ -62,19 +64,21 @@ typedef struct skin {
     float tangent[4], uv[2];
 } skin;
 
-enum { VIEWS = 8 };
+enum { VIEWS = 8, KINDS = 2 /* of textures */ };
 
 typedef struct model {
     tl_mesh_coding coding;
     bool level_steps; /* horizontal steps are 1: those of the lattice */
     double step[3];   /* of quantised positions */
-    view views[VIEWS];
+    view *views;      /* VIEWS, and KINDS a tile */
     int view_count;
     vertex *vertices;
     morph *morphs; /* NULL: not asked for */
     skin *skins;   /* the same */
     unsigned textures;
-    out_texture texture;
+    out_texture texture;         /* of a mesh in one tile */
+    out_texture_tiles tiles;     /* of others; else there are none */
+    out_texture *tile_textures;  /* one a tile */
     gltf_directions *directions; /* of the whole mesh, where any are asked for: borrowed */
     bool tangents;
     int indices_view, morph_view, tangent_view, uv_view, image_view;
@@ -226,13 +230,16 @@ static tl_status order_vertices(model *m, const vertex *placed, const char *path
 /* Fills m->skins, of vertices in the mesh's order, and, where the texture has the normals, makes theirs point up. */
 static tl_status place_skins(const tl_mesh *mesh, vertex *placed, model *m, const char *path, tl_error *error)
 {
+    size_t tile = 0;
     for (size_t k = 0; k < mesh->vertex_count; k++) {
         const tl_vertex *v = &mesh->vertices[k];
         skin *s = &m->skins[k];
         gltf_direction d;
         double up[3];
         *s = (skin){{0}, {0}};
-        out_texture_place(&m->texture, v->i, v->j, s->uv);
+        while (m->tiles.count && k >= m->tiles.tiles[tile].first_vertex + m->tiles.tiles[tile].vertices)
+            tile++;
+        out_texture_place(m->tiles.count ? &m->tile_textures[tile] : &m->texture, v->i, v->j, s->uv);
         if (!m->tangents)
             continue;
         if (!gltf_direction_at(m->directions, v->i, v->j, (double)v->z, &d))
@@ -277,17 +284,76 @@ static tl_status open_texture(const tl_mesh *mesh, const out_frame *frame, model
     return status;
 }
 
+/* Whether the mesh's finest triangles are finer than the texels of one texture, as they are beside a view's eye: then
+ * it is cut into tiles. */
+static bool asks_for_tiles(const tl_mesh *mesh, const model *m, const tl_source *ground)
+{
+    return scene_field_nests(ground) && m->texture.step > ldexp(1, out_finest_edge(mesh));
+}
+
+static const char *const texture_layers[KINDS] = {"albedo", "tangent"}; /* by tl_texture's bits */
+
+typedef struct tile_painting {
+    const model *m;
+    const scene_layer *layers[KINDS];
+    int kinds;
+    const char *path;
+    const tl_run *run;
+} tile_painting;
+
+static tl_status paint_tile(void *context, tl_parallel *loop, uint64_t tile, unsigned worker, tl_error *error)
+{
+    const tile_painting *p = context;
+    (void)loop;
+    (void)worker;
+    for (int k = 0; k < p->kinds; k++) {
+        view *v = &p->m->views[p->m->image_view + (int)tile * p->kinds + k];
+        uint64_t bytes = 0;
+        v->bytes = out_texture_bytes(&p->m->tile_textures[tile], p->layers[k], p->path, p->run, &bytes, error);
+        if (!v->bytes)
+            return TL_ERROR_IO;
+        v->size = v->count = (size_t)bytes;
+        v->stride = 1;
+    }
+    return TL_OK;
+}
+
+static tl_status add_tile_images(model *m, const char *path, const tl_run *run, tl_error *error)
+{
+    scene_layer *made[KINDS] = {NULL, NULL};
+    tile_painting p = {.m = m, .path = path, .run = run};
+    tl_run quiet = run ? *run : (tl_run){0};
+    quiet.progress = NULL;
+    tl_status status = TL_OK;
+    for (int k = 0; k < KINDS && status == TL_OK; k++) {
+        if (!(m->textures >> k & 1))
+            continue;
+        const out_texture *first = &m->tile_textures[0];
+        p.layers[p.kinds] = made[k] = scene_layer_create_over(first->ground, texture_layers[k], first->whole, error);
+        status = made[k] ? TL_OK : TL_ERROR_IO;
+        p.kinds++;
+    }
+    m->image_view = m->view_count;
+    m->view_count += p.kinds * (int)m->tiles.count;
+    if (status == TL_OK)
+        status = tl_parallel_for(&quiet, m->tiles.count, m->tiles.count, paint_tile, &p, error);
+    for (int k = 0; k < KINDS; k++)
+        scene_layer_destroy(made[k]);
+    return status;
+}
+
 /* The pictures, as parts of the binary chunk behind all others. */
 static tl_status add_images(model *m, const char *path, const tl_run *run, tl_error *error)
 {
-    static const char *const layers[] = {"albedo", "tangent"}; /* by tl_texture's bits */
+    if (m->tiles.count)
+        return add_tile_images(m, path, run, error);
     tl_status status = TL_OK;
     m->image_view = m->view_count;
-    for (int k = 0; k < 2 && status == TL_OK; k++) {
+    for (int k = 0; k < KINDS && status == TL_OK; k++) {
         if (!(m->textures >> k & 1))
             continue;
         uint64_t bytes;
-        tl_output *file = out_texture_paint(&m->texture, layers[k], path, run, &bytes, error);
+        tl_output *file = out_texture_paint(&m->texture, texture_layers[k], path, run, &bytes, error);
         if (!file)
             return TL_ERROR_IO;
         m->views[m->view_count++] = (view){.file = file, .size = (size_t)bytes, .count = (size_t)bytes, .stride = 1};
@@ -314,12 +380,71 @@ static void take_vertices(const vertex *ready, model *m)
 static void order_triangles_for(const tl_mesh *mesh, const out_frame *frame, model *m)
 {
     bool flip = !out_frame_faces_up(frame);
-    meshopt_optimizeVertexCache(m->indices, mesh->indices, m->index_count, m->vertex_count);
+    if (!m->tiles.count)
+        meshopt_optimizeVertexCache(m->indices, mesh->indices, m->index_count, m->vertex_count);
+    else
+        memcpy(m->indices, mesh->indices, m->index_count * sizeof *m->indices);
+    for (size_t k = 0; k < m->tiles.count && mesh == &m->tiles.mesh; k++) {
+        const out_texture_tile *tile = &m->tiles.tiles[k];
+        uint32_t *indices = m->indices + 3 * tile->first_triangle;
+        for (size_t c = 0; c < 3 * tile->triangles; c++)
+            indices[c] -= (uint32_t)tile->first_vertex;
+        meshopt_optimizeVertexCache(indices, indices, 3 * tile->triangles, tile->vertices);
+        for (size_t c = 0; c < 3 * tile->triangles; c++)
+            indices[c] += (uint32_t)tile->first_vertex;
+    }
     for (size_t t = 0; flip && t < m->index_count; t += 3) {
         uint32_t swapped = m->indices[t + 1];
         m->indices[t + 1] = m->indices[t + 2];
         m->indices[t + 2] = swapped;
     }
+}
+
+/* All vertices in the frame of the whole, with normals of the ground or by all triangles: so parts of it join. */
+static tl_status place_all(const tl_mesh *mesh, out_frame *frame, const model *start, vertex *placed,
+                           const tl_write_options *options, const char *path, tl_error *error)
+{
+    model m = *start;
+    m.vertex_count = mesh->vertex_count;
+    m.index_count = 3 * mesh->triangle_count;
+    m.vertices = placed;
+    m.indices = tl_alloc(m.index_count, sizeof *m.indices);
+    if (!m.indices)
+        return tl_fail_memory(error, path);
+    order_triangles_for(mesh, frame, &m); /* sums of normals depend on it */
+    tl_status status = place_vertices(mesh, frame, &m, error);
+    if (status == TL_OK && !(m.textures & TL_TEXTURE_NORMAL)) /* else they point up */
+        status = add_normals(mesh, &m, options, error);
+    free(m.indices);
+    return status;
+}
+
+/* Cuts the mesh into the tiles of textures; *ready becomes its vertices, placed, to be freed. `all`: those of the whole
+ * mesh, or NULL. */
+static tl_status cut(const tl_mesh *mesh, out_frame *frame, model *m, const vertex *all, vertex **ready,
+                     const tl_write_options *options, const char *path, tl_error *error)
+{
+    const uint64_t size = options->texture_size ? (uint64_t)options->texture_size : OUT_TEXTURE_SIZE;
+    out_texture_close(&m->texture);
+    tl_status status = out_texture_tiles_init(&m->tiles, mesh, size * size, path, error);
+    if (status != TL_OK)
+        return status;
+    vertex *placed = all ? NULL : tl_alloc(mesh->vertex_count, sizeof *placed);
+    *ready = tl_alloc(m->tiles.mesh.vertex_count, sizeof **ready);
+    m->tile_textures = calloc(m->tiles.count, sizeof *m->tile_textures);
+    if ((!all && !placed) || !*ready || !m->tile_textures)
+        status = tl_fail_memory(error, path);
+    for (size_t k = 0; k < m->tiles.count && status == TL_OK; k++) {
+        const out_texture_tile *tile = &m->tiles.tiles[k];
+        status =
+            out_texture_open_box(options->ground, tile->low, tile->high, tile->spacing, &m->tile_textures[k], error);
+    }
+    if (status == TL_OK && !all)
+        status = place_all(mesh, frame, m, placed, options, path, error);
+    for (size_t k = 0; k < m->tiles.mesh.vertex_count && status == TL_OK; k++)
+        (*ready)[k] = (all ? all : placed)[m->tiles.from[k]];
+    free(placed);
+    return status;
 }
 
 /* `ready`: the vertices, placed, with their normals; NULL: they are placed here. */
@@ -525,8 +650,14 @@ static void free_model(model *m)
         free(m->views[k].bytes);
         tl_output_abort(m->views[k].file);
     }
+    free(m->views);
     if (m->texture.ground)
         out_texture_close(&m->texture);
+    for (size_t k = 0; m->tile_textures && k < m->tiles.count; k++)
+        if (m->tile_textures[k].ground)
+            out_texture_close(&m->tile_textures[k]);
+    free(m->tile_textures);
+    out_texture_tiles_finish(&m->tiles);
     free(m->skins);
     free(m->vertices);
     free(m->morphs);
@@ -606,6 +737,16 @@ static json_t *normalized(const model *m, json_t *accessor)
     return accessor;
 }
 
+/* The indices of a tile, or of all. */
+static json_t *index_accessor(const model *m, size_t tile)
+{
+    bool small = small_indices(m);
+    const out_texture_tile *t = m->tiles.count ? &m->tiles.tiles[tile] : NULL;
+    size_t item = small ? sizeof(uint16_t) : sizeof(uint32_t);
+    return accessor(m->indices_view, t ? 3 * t->first_triangle * item : 0, small ? COMPONENT_U16 : COMPONENT_U32,
+                    t ? 3 * t->triangles : m->index_count, "SCALAR");
+}
+
 static json_t *accessors(const model *m)
 {
     bool plain = m->coding == TL_CODING_PLAIN;
@@ -614,9 +755,7 @@ static json_t *accessors(const model *m)
         accessor(plain ? 0 : 1, plain ? 12 : 0, plain ? COMPONENT_FLOAT : COMPONENT_I16, m->vertex_count, "VEC3");
     add_bounds(m, position);
     normalized(m, normal);
-    int component = small_indices(m) ? COMPONENT_U16 : COMPONENT_U32;
-    json_t *list =
-        json_pack("[o,o,o]", position, normal, accessor(m->indices_view, 0, component, m->index_count, "SCALAR"));
+    json_t *list = json_pack("[o,o,o]", position, normal, index_accessor(m, 0));
     if (m->morphs) {
         json_t *by = accessor(m->morph_view, 0, COMPONENT_FLOAT, m->vertex_count, "VEC3");
         add_range(m, by);
@@ -629,6 +768,8 @@ static json_t *accessors(const model *m)
     if (m->skins)
         json_array_append_new(list, normalized(m, accessor(m->uv_view, 0, plain ? COMPONENT_FLOAT : COMPONENT_U16,
                                                            m->vertex_count, "VEC2")));
+    for (size_t tile = 1; tile < m->tiles.count; tile++)
+        json_array_append_new(list, index_accessor(m, tile));
     return list;
 }
 
@@ -737,6 +878,35 @@ static void add_target(json_t *root)
     json_object_set_new(mesh, "extras", json_pack("{s:[s]}", "targetNames", "parent"));
 }
 
+/* One primitive and material for each tile, of the same vertices, from those of the first. */
+static void add_tiles(const model *m, int indices, json_t *root)
+{
+    json_t *mesh = json_array_get(json_object_get(root, "meshes"), 0);
+    json_t *primitives = json_object_get(mesh, "primitives"), *materials = json_object_get(root, "materials");
+    json_t *images = json_object_get(root, "images"), *textures = json_object_get(root, "textures");
+    size_t kinds = json_array_size(images);
+    for (size_t tile = 1; tile < m->tiles.count; tile++) {
+        json_t *primitive = json_copy(json_array_get(primitives, 0));
+        json_t *material = json_deep_copy(json_array_get(materials, 0));
+        json_t *colour = json_object_get(json_object_get(material, "pbrMetallicRoughness"), "baseColorTexture");
+        json_t *normal = json_object_get(material, "normalTexture");
+        json_int_t first = (json_int_t)(tile * kinds), next = first;
+        json_object_set_new(primitive, "indices", json_integer(indices + (json_int_t)tile - 1));
+        json_object_set_new(primitive, "material", json_integer((json_int_t)tile));
+        if (colour)
+            json_object_set_new(colour, "index", json_integer(next++));
+        if (normal)
+            json_object_set_new(normal, "index", json_integer(next++));
+        for (; first < next; first++) {
+            json_array_append_new(images,
+                                  json_pack("{s:I,s:s}", "bufferView", m->image_view + first, "mimeType", "image/png"));
+            json_array_append_new(textures, json_pack("{s:i,s:I}", "sampler", 0, "source", first));
+        }
+        json_array_append_new(primitives, primitive);
+        json_array_append_new(materials, material);
+    }
+}
+
 /* Colours and normals of the material, and where vertices lie on them. */
 static void add_textures(const model *m, json_t *root)
 {
@@ -764,6 +934,7 @@ static void add_textures(const model *m, json_t *root)
     json_object_set_new(root, "samplers",
                         json_pack("[{s:i,s:i,s:i,s:i}]", "magFilter", LINEAR, "minFilter", LINEAR_MIPMAP_LINEAR,
                                   "wrapS", CLAMP_TO_EDGE, "wrapT", CLAMP_TO_EDGE));
+    add_tiles(m, next + 1, root);
 }
 
 static char *describe(const tl_mesh *mesh, const out_frame *frame, const model *m)
@@ -846,8 +1017,18 @@ static tl_status write_model(const tl_mesh *mesh, out_frame *frame, const model 
     const char *path = tl_output_path(output);
     model m = *start;
     tl_status status = TL_OK;
+    vertex *ready_tiles = NULL;
+    const tl_mesh *whole = mesh;
     if (m.textures)
         status = open_texture(mesh, frame, &m, options, path, error);
+    if (status == TL_OK && m.textures && asks_for_tiles(mesh, &m, options->ground)) {
+        status = cut(mesh, frame, &m, ready, &ready_tiles, options, path, error);
+        mesh = status == TL_OK ? &m.tiles.mesh : whole;
+        ready = ready_tiles;
+    }
+    m.views = calloc(VIEWS + KINDS * m.tiles.count, sizeof *m.views);
+    if (status == TL_OK && !m.views)
+        status = tl_fail_memory(error, path);
     if (status == TL_OK)
         status = build(mesh, frame, &m, ready, options, path, error);
     if (status == TL_OK)
@@ -858,6 +1039,7 @@ static tl_status write_model(const tl_mesh *mesh, out_frame *frame, const model 
     if (status == TL_OK)
         status = json ? write_file(&m, json, output, error) : tl_fail_memory(error, path);
     free(json);
+    free(ready_tiles);
     free_model(&m);
     return status;
 }
@@ -984,25 +1166,6 @@ static tl_status order_triangles(parts *p, const char *path, tl_error *error)
     return TL_OK;
 }
 
-/* All vertices in the frame of the whole, with normals of the ground or by all triangles: so the parts join. */
-static tl_status place_all(parts *p, out_frame *frame, const model *start, const char *path,
-                           const tl_write_options *options, tl_error *error)
-{
-    model m = *start;
-    m.vertex_count = p->mesh->vertex_count;
-    m.index_count = 3 * p->mesh->triangle_count;
-    m.vertices = p->placed;
-    m.indices = tl_alloc(m.index_count, sizeof *m.indices);
-    if (!m.indices)
-        return tl_fail_memory(error, path);
-    order_triangles_for(p->mesh, frame, &m); /* sums of normals depend on it */
-    tl_status status = place_vertices(p->mesh, frame, &m, error);
-    if (status == TL_OK)
-        status = add_normals(p->mesh, &m, options, error);
-    free(m.indices);
-    return status;
-}
-
 static void take_part(parts *p, size_t tile)
 {
     tl_mesh *part = &p->part;
@@ -1112,7 +1275,7 @@ tl_status out_gltf_write_parts(const tl_mesh *mesh, const char *path, const tl_w
     if (status == TL_OK)
         status = make_room(&p, most, path, error);
     if (status == TL_OK)
-        status = place_all(&p, frame, &start, path, options, error);
+        status = place_all(mesh, frame, &start, p.placed, options, path, error);
     size_t tile = 0, tiles = (size_t)(p.across * p.across);
     for (; status == TL_OK && tile < tiles; tile++)
         if (p.first[tile + 1] > p.first[tile])

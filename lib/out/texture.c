@@ -93,6 +93,8 @@ static bool take_level(const tl_source *surface, int halvings, int most, out_tex
         return false;
     double step = ldexp(1, halvings), inner = ldexp(1, surface->info.level - g->level);
     double offset = surface->info.type == TL_RASTER_AREA ? (inner - 1) / 2 : 0; /* means stand in their cells' middle */
+    if (g->from != surface && g->from->info.type == TL_RASTER_AREA && surface->info.type != TL_RASTER_AREA)
+        offset = (inner - ldexp(1, surface->info.level)) / 2; /* of a model whose own samples are taken for points */
     for (int a = 0; a < 2; a++) {
         from[a] = tl_int64_max(0, (int64_t)floor(((double)t->low[a] - offset) / step));
         to[a] = tl_int64_min(size[a] - 1, (int64_t)ceil(((double)t->high[a] - offset) / step));
@@ -121,14 +123,22 @@ static void set_place(const tl_source *surface, const out_texture *t, tl_source_
     to->cell_y *= t->step;
 }
 
-tl_status out_texture_open(const tl_mesh *mesh, const tl_source *surface, int most, out_texture *out, tl_error *error)
+static ground *ground_create(const tl_source *surface)
 {
     ground *g = calloc(1, sizeof *g);
+    if (g) {
+        g->source = (tl_source){.info = surface->info, .read = ground_read, .destroy = ground_destroy};
+        g->source.info.level = 0;
+    }
+    return g;
+}
+
+tl_status out_texture_open(const tl_mesh *mesh, const tl_source *surface, int most, out_texture *out, tl_error *error)
+{
+    ground *g = ground_create(surface);
     *out = (out_texture){.whole = scene_field_dem(surface) ? scene_field_dem(surface) : surface};
     if (!g)
         return tl_fail_memory(error, surface->info.name);
-    g->source = (tl_source){.info = surface->info, .read = ground_read, .destroy = ground_destroy};
-    g->source.info.level = 0;
     find_box(mesh, out);
     int halvings = 0;
     while (halvings < MOST_HALVINGS && !take_level(surface, halvings, most ? most : OUT_TEXTURE_SIZE, out, g))
@@ -139,6 +149,24 @@ tl_status out_texture_open(const tl_mesh *mesh, const tl_source *surface, int mo
         return TL_OK;
     out_texture_close(out);
     return tl_fail(error, TL_ERROR_ARGUMENT, "%s: no level of it fits into a texture", surface->info.name);
+}
+
+tl_status out_texture_open_box(const tl_source *surface, const int64_t low[2], const int64_t high[2], int spacing,
+                               out_texture *out, tl_error *error)
+{
+    ground *g = ground_create(surface);
+    *out = (out_texture){.whole = scene_field_dem(surface) ? scene_field_dem(surface) : surface};
+    if (!g)
+        return tl_fail_memory(error, surface->info.name);
+    memcpy(out->low, low, sizeof out->low);
+    memcpy(out->high, high, sizeof out->high);
+    out->ground = &g->source;
+    bool good = take_level(surface, spacing, INT32_MAX, out, g);
+    set_place(surface, out, &g->source.info);
+    if (good)
+        return TL_OK;
+    out_texture_close(out);
+    return tl_fail(error, TL_ERROR_DATA, "%s: has no samples for a texture", surface->info.name);
 }
 
 void out_texture_close(out_texture *texture)
@@ -251,5 +279,33 @@ tl_output *out_texture_paint(const out_texture *texture, const char *layer, cons
     if (status == TL_OK)
         return output;
     tl_output_abort(output);
+    return NULL;
+}
+
+unsigned char *out_texture_bytes(const out_texture *texture, const scene_layer *layer, const char *path,
+                                 const tl_run *run, uint64_t *bytes, tl_error *error)
+{
+    scene_layer *own = scene_layer_copy_over(layer, texture->ground);
+    tl_output *output = own ? tl_output_open(path, true, error) : NULL;
+    painting p = {.layer = own, .width = texture->ground->info.width, .height = texture->ground->info.height};
+    unsigned char *out = NULL;
+    tl_status status = output ? TL_OK : own ? TL_ERROR_IO : tl_fail_memory(error, path);
+    p.rgba = tl_alloc_grid(p.width, p.height, 4);
+    if (status == TL_OK && !p.rgba)
+        status = tl_fail_memory(error, path);
+    if (status == TL_OK)
+        status = out_texture_pixels(own, (tl_window){0, 0, p.width, p.height}, p.rgba, error);
+    if (status == TL_OK)
+        status = write_png(&p, output, run, bytes, error);
+    if (status == TL_OK) {
+        out = calloc(((size_t)*bytes + 3) / 4, 4);
+        status = out ? tl_output_read_at(output, out, (size_t)*bytes, 0, error) : tl_fail_memory(error, path);
+    }
+    tl_output_abort(output);
+    scene_layer_destroy(own);
+    free(p.rgba);
+    if (status == TL_OK)
+        return out;
+    free(out);
     return NULL;
 }

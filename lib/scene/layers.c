@@ -454,6 +454,16 @@ scene_layer *scene_layer_create_over(const tl_source *heights, const char *kind,
     return create(heights, kind, NULL, colours_of, error);
 }
 
+scene_layer *scene_layer_copy_over(const scene_layer *layer, const tl_source *heights)
+{
+    scene_layer *copy = malloc(sizeof *copy);
+    if (copy) {
+        *copy = *layer;
+        copy->heights = heights;
+    }
+    return copy;
+}
+
 void scene_layer_destroy(scene_layer *layer)
 {
     free(layer);

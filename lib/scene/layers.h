@@ -18,6 +18,9 @@ scene_layer *scene_layer_create(const tl_source *heights, const char *kind, cons
 /* The same with default options; colours spread over the heights of `colours_of`. */
 scene_layer *scene_layer_create_over(const tl_source *heights, const char *kind, const tl_source *colours_of,
                                      tl_error *error);
+/* The same layer, with the same colours, over another lattice of the same ground: its axes have the same directions.
+ * NULL when out of memory. */
+scene_layer *scene_layer_copy_over(const scene_layer *layer, const tl_source *heights);
 void scene_layer_destroy(scene_layer *layer);
 const tl_layer_kind *scene_layer_kind(const scene_layer *layer);
 /* The window's values, channel by channel; NaN where the height is void. Any number of threads. */
