@@ -734,6 +734,243 @@ static void othersGroundIsRefused(void **state)
     tl_source_destroy(narrow);
 }
 
+/* ---- Tiles of a view's textures ---- */
+
+enum { DEEP = 4, ACROSS = (WIDTH - 1) << DEEP, DOWN = (HEIGHT - 1) << DEEP };
+
+/* The field whose right isosceles triangles get finer towards a corner: squares that are halved while they touch it. */
+static void add_square(tl_mesh *mesh, int x, int y, int side)
+{
+    if (side > 1 && x <= ACROSS / 2 && ACROSS / 2 <= x + side && y <= DOWN / 2 && DOWN / 2 <= y + side) {
+        for (int q = 0; q < 4; q++)
+            add_square(mesh, x + (q & 1) * side / 2, y + (q >> 1) * side / 2, side / 2);
+        return;
+    }
+    if (x + side > ACROSS || y + side > DOWN)
+        return;
+    uint32_t first = (uint32_t)mesh->vertex_count;
+    for (int c = 0; c < 4; c++)
+        mesh->vertices[mesh->vertex_count++] = (tl_vertex){x + (c & 1) * side, y + (c >> 1) * side, 300};
+    const uint32_t corners[6] = {first, first + 2, first + 1, first + 1, first + 2, first + 3};
+    memcpy(mesh->indices + 3 * mesh->triangle_count, corners, sizeof corners);
+    mesh->triangle_count += 2;
+}
+
+/* Where a tile's texel (0, 0) lies and how far it is to the next, in samples, by two of its vertices an axis. */
+typedef struct laid {
+    double first[2], step[2];
+} laid;
+
+typedef struct tile_view {
+    size_t count;     /* of corners */
+    size_t *vertices; /* of the shared arrays */
+    int *places;      /* columns and rows */
+    int width, height;
+    unsigned char *png;
+    laid at;
+} tile_view;
+
+static tile_view open_tile(const tl_source *field, const glb *g, size_t tile)
+{
+    json_t *primitive = json_array_get(json_object_get(item(g->json, "meshes", 0), "primitives"), tile);
+    json_t *indices = item(g->json, "accessors", whole(primitive, "indices"));
+    json_t *material = item(g->json, "materials", whole(primitive, "material"));
+    json_t *colour = json_object_get(json_object_get(material, "pbrMetallicRoughness"), "baseColorTexture");
+    const double *t = field->info.georef.transform;
+    tile_view out = {.count = (size_t)whole(indices, "count")};
+    const unsigned char *at = g->binary +
+                              whole(item(g->json, "bufferViews", whole(indices, "bufferView")), "byteOffset") +
+                              whole(indices, "byteOffset");
+    out.vertices = malloc(out.count * sizeof *out.vertices);
+    out.places = malloc(2 * out.count * sizeof *out.places);
+    out.png = decode_png(g, whole(colour, "index"), &out.width, &out.height);
+    double low[2] = {HUGE_VAL, HUGE_VAL}, high[2] = {-HUGE_VAL, -HUGE_VAL}, texel_low[2], texel_high[2];
+    for (size_t k = 0; k < out.count; k++) {
+        uint16_t small;
+        uint32_t index;
+        memcpy(&small, at + 2 * k, 2);
+        memcpy(&index, at + 4 * k, 4);
+        out.vertices[k] = whole(indices, "componentType") == 5123 ? small : index;
+        double place[3], uv[2];
+        attribute(g, "POSITION", out.vertices[k], 3, place);
+        attribute(g, "TEXCOORD_0", out.vertices[k], 2, uv);
+        for (size_t a = 0; a < 3; a++)
+            place[a] = place[a] * of_node(g, "scale", a, 1) + of_node(g, "translation", a, 0);
+        const double sample[2] = {(place[0] - t[0]) / t[1], (-place[2] - t[3]) / t[5]};
+        for (int a = 0; a < 2; a++) {
+            out.places[2 * k + (size_t)a] = (int)lrint(sample[a]);
+            double texel = uv[a] * (a ? out.height : out.width) - 0.5;
+            if (sample[a] < low[a])
+                low[a] = sample[a], texel_low[a] = texel;
+            if (sample[a] > high[a])
+                high[a] = sample[a], texel_high[a] = texel;
+        }
+    }
+    for (int a = 0; a < 2; a++) {
+        out.at.step[a] = (high[a] - low[a]) / (texel_high[a] - texel_low[a]);
+        out.at.first[a] = low[a] - texel_low[a] * out.at.step[a];
+    }
+    return out;
+}
+
+static void close_tile(tile_view *tile)
+{
+    free(tile->vertices);
+    free(tile->places);
+    free(tile->png);
+}
+
+static int shortest_of(const tile_view *tile)
+{
+    int shortest = INT32_MAX;
+    for (size_t k = 0; k < tile->count; k++) {
+        size_t next = k % 3 == 2 ? k - 2 : k + 1;
+        int x = abs(tile->places[2 * k] - tile->places[2 * next]);
+        int y = abs(tile->places[2 * k + 1] - tile->places[2 * next + 1]), edge = x > y ? x : y;
+        shortest = edge < shortest ? edge : shortest;
+    }
+    return shortest;
+}
+
+/* Each texel has the colour of the field's sample where the vertices' coordinates lay it: so texels of neighbours that
+ * lie on one sample are equal, too. */
+static void check_colours(const tl_source *field, const unsigned char *wanted, const tile_view *tile)
+{
+    for (int q = 0; q < tile->height; q++)
+        for (int p = 0; p < tile->width; p++) {
+            double x = tile->at.first[0] + p * tile->at.step[0], y = tile->at.first[1] + q * tile->at.step[1];
+            assert_near(x, rint(x), 0.05); /* single precision's error grows over the tile */
+            assert_near(y, rint(y), 0.05);
+            size_t k = (size_t)(lrint(y) * field->info.width + lrint(x));
+            assert_memory_equal(tile->png + 3 * (q * tile->width + p), wanted + 3 * k, 3);
+        }
+}
+
+/* Triangles by the places of their corners, the smallest first. */
+static int compare_triangles(const void *a, const void *b)
+{
+    return memcmp(a, b, 6 * sizeof(int));
+}
+
+static void note_triangle(const int places[6], int *out)
+{
+    int first = 0;
+    for (int c = 1; c < 3; c++)
+        first = compare_triangles((int[6]){places[2 * c], places[2 * c + 1]},
+                                  (int[6]){places[2 * first], places[2 * first + 1]}) < 0
+                    ? c
+                    : first;
+    for (int c = 0; c < 3; c++)
+        memcpy(out + 2 * c, places + 2 * ((first + c) % 3), 2 * sizeof *out);
+}
+
+static void check_triangles(const tl_mesh *mesh, int *found)
+{
+    int *wanted = malloc(6 * mesh->triangle_count * sizeof *wanted);
+    for (size_t t = 0; t < mesh->triangle_count; t++) {
+        int places[6];
+        for (size_t c = 0; c < 3; c++) {
+            const tl_vertex *v = &mesh->vertices[mesh->indices[3 * t + c]];
+            places[2 * c] = v->i, places[2 * c + 1] = v->j;
+        }
+        note_triangle(places, wanted + 6 * t);
+    }
+    qsort(wanted, mesh->triangle_count, 6 * sizeof *wanted, compare_triangles);
+    qsort(found, mesh->triangle_count, 6 * sizeof *found, compare_triangles);
+    assert_memory_equal(found, wanted, 6 * mesh->triangle_count * sizeof *found);
+    free(wanted);
+}
+
+typedef struct near_view {
+    tl_source *field;
+    tl_mesh mesh;
+    unsigned char *wanted; /* colours of all samples */
+} near_view;
+
+static near_view open_near_view(bench *b)
+{
+    const tl_field_options options = {.levels = DEEP,
+                                      .seed = 3,
+                                      .scheme = "stationary",
+                                      .hurst = 0.5,
+                                      .delta = 9,
+                                      .hurst_given = true,
+                                      .delta_given = true,
+                                      .support = TL_SUPPORT_POINT};
+    enum { ROOM = 4096 };
+    near_view v = {.field = tl_field_create(b->source, &options, NULL)};
+    assert_non_null(v.field);
+    assert_int_equal(v.field->info.width, ACROSS + 1);
+    v.mesh = (tl_mesh){.georef = v.field->info.georef,
+                       .vertices = malloc(ROOM * sizeof(tl_vertex)),
+                       .indices = malloc(6 * ROOM * sizeof(uint32_t))};
+    for (int k = 0; k < 4; k++)
+        add_square(&v.mesh, (k & 1) * 1024, (k >> 1) * 1024, 1024);
+    v.wanted = paint(v.field, "albedo");
+    return v;
+}
+
+static void close_near_view(near_view *v)
+{
+    tl_source_destroy(v->field);
+    free(v->mesh.vertices);
+    free(v->mesh.indices);
+    free(v->wanted);
+}
+
+/* Of a mesh that is finest at one place: the tile there has the finest texels, others those of their own vertices or of
+ * 256 on the side of their square. No triangle is lost or doubled. */
+static void check_tiles(bench *b, near_view *v, tl_mesh_coding coding, int size, int finest, bool budget)
+{
+    tl_error error;
+    const tl_write_options options = {
+        .overwrite = true, .ground = v->field, .textures = TL_TEXTURE_COLOUR, .texture_size = size, .coding = coding};
+    if (tl_write_mesh(&v->mesh, b->path, &options, &error) != TL_OK)
+        fail_msg("%s", error.text);
+    glb g = read_glb(b->path);
+    size_t tiles = json_array_size(json_object_get(item(g.json, "meshes", 0), "primitives")), triangles = 0;
+    int *found = malloc(6 * v->mesh.triangle_count * sizeof *found), least = INT32_MAX;
+    int64_t texels = 0;
+    assert_true(tiles > 1 && tiles <= 256);
+    for (size_t k = 0; k < tiles; k++) {
+        tile_view tile = open_tile(v->field, &g, k);
+        int step = (int)lrint(tile.at.step[0]), own = shortest_of(&tile);
+        assert_near(tile.at.step[0], tile.at.step[1], 0.01 * step);
+        assert_true(budget || step <= own);
+        least = step < least ? step : least;
+        texels += (int64_t)tile.width * tile.height;
+        if (coding == TL_CODING_PLAIN)
+            check_colours(v->field, v->wanted, &tile);
+        for (size_t t = 0; t < tile.count / 3 && triangles < v->mesh.triangle_count; t++)
+            note_triangle(tile.places + 6 * t, found + 6 * triangles++);
+        close_tile(&tile);
+    }
+    assert_int_equal(least, finest);
+    assert_true(texels <= (int64_t)size * size);
+    assert_int_equal(triangles, v->mesh.triangle_count);
+    check_triangles(&v->mesh, found);
+    free(found);
+    close_glb(&g);
+}
+
+static void texturesFollowTheTrianglesOfAView(void **state)
+{
+    bench *b = *state;
+    near_view v = open_near_view(b);
+    check_tiles(b, &v, TL_CODING_PLAIN, 700, 1, false);
+    check_tiles(b, &v, TL_CODING_QUANTIZED, 700, 1, false);
+    close_near_view(&v);
+}
+
+/* With fewer texels than that takes, all are coarser alike. */
+static void texturesOfAViewKeepTheirBudget(void **state)
+{
+    bench *b = *state;
+    near_view v = open_near_view(b);
+    check_tiles(b, &v, TL_CODING_PLAIN, 190, 2, true);
+    close_near_view(&v);
+}
+
 int main(void)
 {
     const struct CMUnitTest tests[] = {
@@ -748,6 +985,8 @@ int main(void)
         cmocka_unit_test_setup_teardown(normalsAreMeansOverTheShortestEdge, setUp, tearDown),
         cmocka_unit_test_setup_teardown(whatHangsBelowIsNoGround, setUp, tearDown),
         cmocka_unit_test_setup_teardown(othersGroundIsRefused, setUp, tearDown),
+        cmocka_unit_test_setup_teardown(texturesFollowTheTrianglesOfAView, setUp, tearDown),
+        cmocka_unit_test_setup_teardown(texturesOfAViewKeepTheirBudget, setUp, tearDown),
         cmocka_unit_test_setup_teardown(whatHasNoMetresHasNoNormals, setUp, tearDown),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);

@@ -144,6 +144,13 @@ static void find_boxes(cutting *c)
     }
 }
 
+/* Whether texels twice as far apart would still be two a side. */
+static bool has_room(const out_texture_tile *tile)
+{
+    int64_t side = tl_int64_min(tile->high[0] - tile->low[0], tile->high[1] - tile->low[1]);
+    return side >> tile->spacing >= 2;
+}
+
 /* Doubles all spacings until there are few enough texels. */
 static void keep_budget(cutting *c, uint64_t most)
 {
@@ -157,7 +164,7 @@ static void keep_budget(cutting *c, uint64_t most)
         if (texels <= (double)most)
             return;
         for (size_t k = 0; k < c->count; k++)
-            c->tiles[k].spacing++;
+            c->tiles[k].spacing += has_room(&c->tiles[k]);
     }
 }
 
