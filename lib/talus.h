@@ -1055,7 +1055,10 @@ typedef struct tl_write_options {
      * rim and beside voids. NULL: normals are those of the mesh's own triangles, weighted by their areas. */
     const tl_source *ground;
     /* GLB: textures of `ground`: tl_texture values, added. Texels are samples of its finest level that has at most
-     * texture_size (0: 4096) a side, a PNG each. With TL_TEXTURE_NORMAL the vertices' own normals point up and tangents
+     * texture_size (0: 4096) a side, a PNG each. Where that is coarser than the finest triangles of a mesh over a
+     * field of point samples, as in a view, the mesh is cut into squares, primitives with pictures of their own: texels
+     * are samples of the level of a square's own finest vertices, or of one that is coarser by as much for all, so that
+     * there are at most texture_size^2 together. With TL_TEXTURE_NORMAL the vertices' own normals point up and tangents
      * along rows: the texture holds the slopes, in metres. */
     unsigned textures;
     int texture_size;

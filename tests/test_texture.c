@@ -765,6 +765,7 @@ typedef struct tile_view {
     size_t count;     /* of corners */
     size_t *vertices; /* of the shared arrays */
     int *places;      /* columns and rows */
+    double *texels;   /* where they lie in the picture: 0 is the middle of the first */
     int width, height;
     unsigned char *png;
     laid at;
@@ -783,6 +784,7 @@ static tile_view open_tile(const tl_source *field, const glb *g, size_t tile)
                               whole(indices, "byteOffset");
     out.vertices = malloc(out.count * sizeof *out.vertices);
     out.places = malloc(2 * out.count * sizeof *out.places);
+    out.texels = malloc(2 * out.count * sizeof *out.texels);
     out.png = decode_png(g, whole(colour, "index"), &out.width, &out.height);
     double low[2] = {HUGE_VAL, HUGE_VAL}, high[2] = {-HUGE_VAL, -HUGE_VAL}, texel_low[2], texel_high[2];
     for (size_t k = 0; k < out.count; k++) {
@@ -800,6 +802,7 @@ static tile_view open_tile(const tl_source *field, const glb *g, size_t tile)
         for (int a = 0; a < 2; a++) {
             out.places[2 * k + (size_t)a] = (int)lrint(sample[a]);
             double texel = uv[a] * (a ? out.height : out.width) - 0.5;
+            out.texels[2 * k + (size_t)a] = texel;
             if (sample[a] < low[a])
                 low[a] = sample[a], texel_low[a] = texel;
             if (sample[a] > high[a])
@@ -817,6 +820,7 @@ static void close_tile(tile_view *tile)
 {
     free(tile->vertices);
     free(tile->places);
+    free(tile->texels);
     free(tile->png);
 }
 
@@ -844,6 +848,20 @@ static void check_colours(const tl_source *field, const unsigned char *wanted, c
             size_t k = (size_t)(lrint(y) * field->info.width + lrint(x));
             assert_memory_equal(tile->png + 3 * (q * tile->width + p), wanted + 3 * k, 3);
         }
+}
+
+/* Vertices lie in the middle of the texel of their own sample, at the borders of tiles too: what is left and right of a
+ * border has one colour there. */
+static void check_vertices(const tl_source *field, const unsigned char *wanted, const tile_view *tile)
+{
+    for (size_t k = 0; k < tile->count; k++) {
+        const double *at = tile->texels + 2 * k;
+        for (int a = 0; a < 2; a++)
+            assert_near(at[a], rint(at[a]), 1e-4); /* of 257 texels, in single precision */
+        size_t texel = (size_t)(lrint(at[1]) * tile->width + lrint(at[0]));
+        size_t sample = (size_t)(tile->places[2 * k + 1] * field->info.width + tile->places[2 * k]);
+        assert_memory_equal(tile->png + 3 * texel, wanted + 3 * sample, 3);
+    }
 }
 
 /* Triangles by the places of their corners, the smallest first. */
@@ -941,6 +959,8 @@ static void check_tiles(bench *b, near_view *v, tl_mesh_coding coding, int size,
         texels += (int64_t)tile.width * tile.height;
         if (coding == TL_CODING_PLAIN)
             check_colours(v->field, v->wanted, &tile);
+        if (coding == TL_CODING_PLAIN && !budget)
+            check_vertices(v->field, v->wanted, &tile);
         for (size_t t = 0; t < tile.count / 3 && triangles < v->mesh.triangle_count; t++)
             note_triangle(tile.places + 6 * t, found + 6 * triangles++);
         close_tile(&tile);
