@@ -22,7 +22,7 @@ typedef struct settings {
     int format, coding;
     double max_error;
     int64_t extra, seed;
-    const char *levels, *shard, *attribution, *layers;
+    const char *levels, *shard, *attribution, *layers, *mbtiles;
     bool no_normals, resume, finish, dry_run;
     double outside;
     tl_field_options field;
@@ -161,8 +161,11 @@ static int make_tiles(const settings *set, const arguments *inputs, tl_tiles_opt
             status = command_failed(&bar, &error);
     } else if (!source || tl_write_terrain_tiles(source, set->common.output, options, &made, &error) != TL_OK)
         status = command_failed(&bar, &error);
-    else
+    else {
         report(set, &made, progress_end(&bar));
+        if (set->mbtiles && made.complete && tl_pack_mbtiles(set->common.output, set->mbtiles, false, &error) != TL_OK)
+            status = command_failed(&bar, &error);
+    }
     tl_source_destroy(field);
     command_close(&opened);
     return status;
@@ -190,6 +193,10 @@ static bool heights_ok(const settings *set)
 
 static bool format_ok(const settings *set)
 {
+    if (set->mbtiles && (set->format != TL_TILES_QUANTIZED_MESH || set->dry_run)) {
+        complain("--mbtiles is for --format quantized-mesh%s", set->dry_run ? ", and not for --dry-run" : "");
+        return false;
+    }
     if (set->format == TL_TILES_3D || (set->coding == CODING_QUANTIZED && !set->layers))
         return true;
     complain("%s is for --format 3dtiles", set->layers ? "--layers" : "--coding");
@@ -218,6 +225,8 @@ static int run_tiles(const command *self, int argc, const char **argv, bool help
         {"layers", 0, OPTION_TEXT, &set.layers, NULL, "KINDS",
          "of 3dtiles: pictures on the tiles, colour (by height, without light), normal or both, with a comma", 0, 0,
          NULL},
+        {"mbtiles", 0, OPTION_TEXT, &set.mbtiles, NULL, "FILE",
+         "of quantized-mesh: put the finished tiles into this file, too", 0, 0, NULL},
         {"no-normals", 0, OPTION_FLAG, &set.no_normals, NULL, NULL, "leave the vertices' normals away", 0, 0, NULL},
         {"outside", 0, OPTION_NUMBER, &set.outside, NULL, "METRES",
          "height of ground that the DEM does not know, of quantized-mesh (default: 0)", -1e5, 1e5, NULL},

@@ -1,7 +1,7 @@
 # Sourced by run.sh here and in tests/: which Debian packages talus needs, and how they get there.
 
 build_packages="gcc g++ meson ninja-build pkg-config libtiff-dev libgeotiff-dev libproj-dev libgeographiclib-dev
-libopenexr-dev libmeshoptimizer-dev libpng-dev libdeflate-dev libjansson-dev libpopt-dev libkissfft-dev libcairo2-dev libmicrohttpd-dev scdoc"
+libopenexr-dev libmeshoptimizer-dev libpng-dev libdeflate-dev libjansson-dev libpopt-dev libkissfft-dev libcairo2-dev libmicrohttpd-dev libsqlite3-dev scdoc"
 test_packages="gnuplot-nox libcmocka-dev clang clang-format libclang-rt-14-dev git"
 
 # Installs those of the named packages that are missing; does nothing, and asks nothing, when all are there.

@@ -1276,6 +1276,11 @@ typedef struct tl_tiles_report {
 TL_API tl_status tl_write_terrain_tiles(const tl_source *source, const char *folder, const tl_tiles_options *options,
                                         tl_tiles_report *out, tl_error *error);
 
+/* Packs a finished folder of quantized-mesh tiles into one file, MBTiles (SQLite; rows from the south, tiles gzipped as
+ * they are, layer.json as the metadata "json"). The folder stays. Equal folders give equal files. TL_ERROR_ARGUMENT
+ * where the library was built without SQLite. */
+TL_API tl_status tl_pack_mbtiles(const char *folder, const char *path, bool overwrite, tl_error *error);
+
 /* ---- Tiles of heights ------------------------------------------------------------------------------ */
 
 typedef enum tl_grid_tiles_format {

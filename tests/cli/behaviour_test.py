@@ -496,6 +496,28 @@ def reports_keep_their_schema(case):
     case.run("report", EXAMPLE, status=2)
 
 
+def mbtiles_hold_the_folder(case):
+    import sqlite3
+    options = ("tiles", EXAMPLE, "--error", 50, "--levels", "0..10", "-q", "-o", "site")
+    case.run(*options, "--mbtiles", "site.mbtiles")
+    with sqlite3.connect(case.path("site.mbtiles")) as database:
+        rows = list(database.execute("select zoom_level, tile_column, tile_row, tile_data from tiles"))
+        facts = dict(database.execute("select name, value from metadata"))
+    database.close()
+    for level, column, row, data in rows:
+        with open(case.path(f"site/{level}/{column}/{row}.terrain"), "rb") as file:
+            expect(file.read() == data, f"{level}/{column}/{row} is another tile")
+    files = sum(name.endswith(".terrain") for _, _, names in os.walk(case.path("site")) for name in names)
+    expect(len(rows) == files > 10, f"{len(rows)} of {files} tiles")
+    with open(case.path("site/layer.json"), encoding="utf-8") as file:
+        expect(json.loads(facts["json"]) == json.load(file) and facts["maxzoom"] == "10", f"{facts}")
+    first = sha256(case.path("site.mbtiles"))
+    case.run(*options, "--resume", "--mbtiles", "again.mbtiles")
+    expect(sha256(case.path("again.mbtiles")) == first, "the file is not the same again")
+    case.run(*options, "--resume", "--mbtiles", "again.mbtiles", status=1)
+    case.run("tiles", EXAMPLE, "-f", "exr", "-o", "heights", "--mbtiles", "h.mbtiles", status=2)
+
+
 def statistics_keep_their_schema(case):
     with open(os.path.join(ROOT, "doc", "stats.schema.json"), encoding="utf-8") as file:
         schema = json.load(file)
@@ -1380,7 +1402,7 @@ TESTS = [
     follows_the_umask,
     tells_a_full_stdout, tells_a_broken_pipe, closed_streams_do_not_go_into_the_output,
     bar_only_on_a_terminal, progress_lines_are_json, quiet_is_silent,
-    json_keeps_its_schema, reports_keep_their_schema, statistics_keep_their_schema, real_files_keep_the_schema, window_costs_its_blocks, a_part_is_that_part, corners_agree_with_gdal,
+    json_keeps_its_schema, reports_keep_their_schema, mbtiles_hold_the_folder, statistics_keep_their_schema, real_files_keep_the_schema, window_costs_its_blocks, a_part_is_that_part, corners_agree_with_gdal,
     names_of_any_bytes,
     serves_the_folder_alone, tiles_of_nothing_are_refused, formats_hold_the_same_heights, outputs_are_read_back, points_and_tiles_are_read_back, sidecars_are_checked, outputs_are_made_again, png_within_half_a_step, point_samples_are_kept, point_samples_of_the_andes_are_kept,
     area_means_stay_on_their_footprint,
