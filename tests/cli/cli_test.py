@@ -1,9 +1,10 @@
 #!/usr/bin/env python3
-"""Command lines and what they must print: cli_test.py PROGRAM [--update] [NAME...]
+"""Command lines and what they must print: cli_test.py PROGRAM [--update] [--valgrind] [NAME...]
 
 A case is NAME.args in tests/golden, a command line; beside it NAME.out and NAME.err hold what it prints (none: nothing) and
 NAME.status its exit status (none: 0). {example} stands for examples/jacksboro.tif, {tmp} for the fresh folder in which the
 program runs and in which the inputs of prepare() lie, {version} for the program's version; times and speeds are T and R.
+--valgrind runs it under memcheck, whose findings, leaks too, are failures.
 --update writes what the program does now; read the difference before you commit it.
 """
 import glob
@@ -15,6 +16,7 @@ import subprocess
 import sys
 
 sys.dont_write_bytecode = True  # the sources may lie in a folder that must stay clean
+import harness
 from harness import EXAMPLE, ROOT, expect, run_tests
 from raster_files import write_tiff
 
@@ -92,6 +94,9 @@ def golden_case(stem, version, update):
 def main():
     program = os.path.abspath(sys.argv[1])
     update = "--update" in sys.argv[2:]
+    if "--valgrind" in sys.argv[2:]:
+        harness.WRAPPER = ["valgrind", "--quiet", "--error-exitcode=99", "--leak-check=full", "--errors-for-leak-kinds=definite",
+                           f"--suppressions={ROOT}/tests/analysis/valgrind.supp"]
     names = [word for word in sys.argv[2:] if not word.startswith("-")]
     version = subprocess.run([program, "version"], stdout=subprocess.PIPE, check=True).stdout.decode().split()[1]
     stems = sorted(path[:-len(".args")] for path in glob.glob(os.path.join(GOLDEN, "*.args")))

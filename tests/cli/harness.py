@@ -21,6 +21,7 @@ os.environ.setdefault("LSAN_OPTIONS", f"suppressions={ROOT}/tests/leaks.txt:prin
 EXAMPLE = os.path.join(ROOT, "examples", "jacksboro.tif")
 SANITIZER = re.compile(r"AddressSanitizer|LeakSanitizer|runtime error:|ThreadSanitizer|MemorySanitizer")
 TIMEOUT = 170
+WRAPPER = []  # a program that runs the program, and its options
 
 
 class Skip(Exception):
@@ -87,7 +88,7 @@ class Case:
         options.setdefault("stdout", subprocess.PIPE)
         options.setdefault("stderr", subprocess.PIPE)
         options.setdefault("stdin", subprocess.DEVNULL)
-        return subprocess.Popen([self.program, *map(str, arguments)], cwd=self.folder, **options)
+        return subprocess.Popen([*WRAPPER, self.program, *map(str, arguments)], cwd=self.folder, **options)
 
     def run(self, *arguments, status=0, **options):
         """Runs the program and checks its exit status (None: any), that no sanitizer complains, and that a failure is told
