@@ -575,20 +575,14 @@ static uint16_t *known_directory(PJ_CONTEXT *context, const dem_geokeys *keys)
 
 /* libgeotiff over our checked copy of the keys, so that it neither meets unsound ones nor depends on how the process
  * has set up libtiff. */
-static PJ *crs_from_keys(PJ_CONTEXT *context, const dem_geokeys *keys)
+static PJ *crs_from_keys(PJ_CONTEXT *context, const dem_geokeys *keys, uint16_t *directory)
 {
     PJ *crs = NULL;
     TIFFMethod methods;
     ST_TIFF *tags = ST_Create();
-    uint16_t *directory = known_directory(context, keys);
-    if (!tags || !directory) {
-        if (tags)
-            ST_Destroy(tags);
-        free(directory);
+    if (!tags)
         return NULL;
-    }
     ST_SetKey(tags, TIFFTAG_GEOKEYDIRECTORY, (int)keys->directory_count, STT_SHORT, directory); /* it copies */
-    free(directory);
     if (keys->double_count)
         ST_SetKey(tags, TIFFTAG_GEODOUBLEPARAMS, (int)keys->double_count, STT_DOUBLE, keys->doubles);
     if (keys->ascii_count)
@@ -660,9 +654,15 @@ static tl_status from_keys(dem_geokeys *keys, const char *path, tl_crs **out, do
     PJ_CONTEXT *context = dem_proj_context();
     if (!context)
         return tl_fail_memory(error, path);
+    uint16_t *directory = known_directory(context, keys);
+    if (!directory) {
+        proj_context_destroy(context);
+        return tl_fail_memory(error, path);
+    }
     dem_locale locale = dem_locale_enter();
     tl_crs *crs = NULL;
-    PJ *made = crs_from_keys(context, keys);
+    PJ *made = crs_from_keys(context, keys, directory);
+    free(directory);
     tl_status status = finish(context, made, path, &crs, scale, error);
     dem_locale_leave(locale);
     proj_context_destroy(context);

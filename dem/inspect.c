@@ -68,8 +68,9 @@ tl_status tl_dem_get_overviews(const tl_source *dem, tl_dem_size *out, unsigned 
         out[found++] = (tl_dem_size){width, height};
     }
     *count = found;
+    status = dem_tiff_check(self.handle, error);
     finish(&self);
-    return TL_OK;
+    return status;
 }
 
 /* Blocks from the first to the last, both included. */

@@ -209,12 +209,16 @@ static tl_status open_source(dem_source *dem, const dem_sharing *sharing, const 
     if (status != TL_OK)
         return status;
     status = read_directory(dem, handle, sharing, options, error);
+    if (status == TL_OK)
+        status = dem_tiff_check(handle, error);
     if (TIFFLastDirectory(handle->tiff)) {
         dem_tiff_give_back(dem->tiff, handle);
         return status;
     }
     if (status == TL_OK)
         status = read_overviews(dem, handle, options->exact_levels, error);
+    if (status == TL_OK)
+        status = dem_tiff_check(handle, error);
     dem_tiff_drop(dem->tiff, handle);
     return status;
 }

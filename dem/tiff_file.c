@@ -3,6 +3,7 @@
 #include "lib/base/error.h"
 #include "lib/base/size.h"
 
+#include <errno.h>
 #include <pthread.h>
 #include <stdio.h>
 #include <string.h>
@@ -29,6 +30,8 @@ static tmsize_t read_bytes(thandle_t user, void *out, tmsize_t count)
 {
     dem_tiff_handle *handle = user;
     int64_t got = dem_file_read_at(handle->file->file, out, count, (int64_t)handle->position);
+    if (got < 0 && !handle->trouble)
+        handle->trouble = errno;
     handle->position += got > 0 ? (uint64_t)got : 0;
     return got > 0 ? got : 0;
 }
@@ -93,6 +96,11 @@ void dem_tiff_forget(dem_tiff_handle *handle)
     handle->message[0] = 0;
 }
 
+tl_status dem_tiff_check(const dem_tiff_handle *handle, tl_error *error)
+{
+    return handle->trouble ? tl_fail_system(error, handle->file->path, "read", handle->trouble) : TL_OK;
+}
+
 /* libtiff begins some messages with the file's name, which ours do already. */
 const char *dem_tiff_message(const dem_tiff_handle *handle, const char *otherwise)
 {
@@ -146,13 +154,15 @@ static tl_status open_handle(const dem_tiff_file *file, uint64_t directory, dem_
     handle->directory = directory;
     handle->tiff = open_tiff(handle);
     if (!handle->tiff || (directory && !TIFFSetSubDirectory(handle->tiff, directory))) {
-        tl_fail(error, TL_ERROR_DATA, "%s: cannot read the TIFF directory (is the file complete?): %s", file->path,
-                dem_tiff_message(handle, "no reason given"));
+        tl_status status = dem_tiff_check(handle, error);
+        if (status == TL_OK)
+            status = tl_fail(error, TL_ERROR_DATA, "%s: cannot read the TIFF directory (is the file complete?): %s",
+                             file->path, dem_tiff_message(handle, "no reason given"));
         if (handle->tiff)
             free_handle(handle);
         else
             free(handle);
-        return TL_ERROR_DATA;
+        return status;
     }
     dem_tiff_forget(handle);
     *out = handle;

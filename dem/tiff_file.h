@@ -17,6 +17,7 @@ typedef struct dem_tiff_handle {
     const void *owner;  /* see dem_tiff_keep */
     int64_t next_row;   /* for its owner; 0 at first */
     uint64_t position;
+    int trouble;       /* errno of the first reading that the system failed, 0: none */
     char message[200]; /* libtiff's first complaint since dem_tiff_forget */
     void *scratch;     /* see dem_tiff_scratch */
     size_t scratch_bytes;
@@ -49,6 +50,9 @@ void dem_tiff_drop(dem_tiff_file *file, dem_tiff_handle *handle);
 void *dem_tiff_scratch(dem_tiff_handle *handle, size_t bytes);
 
 void dem_tiff_forget(dem_tiff_handle *handle);
+/* TL_ERROR_IO, described, where the system has failed to read for this handle: libtiff takes a tag that it cannot read
+ * for one that is not there, and goes on. */
+tl_status dem_tiff_check(const dem_tiff_handle *handle, tl_error *error);
 /* What libtiff said, or `otherwise` where it said nothing. */
 const char *dem_tiff_message(const dem_tiff_handle *handle, const char *otherwise);
 
