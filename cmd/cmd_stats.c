@@ -4,6 +4,7 @@
 #include <math.h>
 #include <stdio.h>
 #include <string.h>
+#include <unistd.h>
 
 typedef struct settings {
     common common;
@@ -220,8 +221,11 @@ static tl_status make_all(const settings *set, const tl_source *source, const tl
         progress_stage(bar, "maps");
         status = tl_statistics_write_maps(source, set->maps, &maps, error);
     }
-    if (status == TL_OK && set->common.output)
+    if (status == TL_OK && set->common.output) {
         status = tl_statistics_plot(s, source->info.name, set->common.output, set->common.overwrite, error);
+        if (status != TL_OK && set->maps)
+            unlink(set->maps); /* a failed run leaves nothing */
+    }
     return status;
 }
 

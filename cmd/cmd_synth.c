@@ -279,6 +279,10 @@ static tl_status write_layers(settings *set, const tl_source *made, const tl_run
 {
     char *list = set->layers && !set->one_file ? strdup(set->layers) : NULL, *rest;
     tl_status status = TL_OK;
+    if (set->layers && !set->one_file && !list) {
+        *error = (tl_error){TL_ERROR_MEMORY, "not enough memory for the layers' names"};
+        return TL_ERROR_MEMORY;
+    }
     for (char *kind = list ? strtok_r(list, ",", &rest) : NULL; kind && status == TL_OK;
          kind = strtok_r(NULL, ",", &rest)) {
         progress_stage(bar, kind);
@@ -296,8 +300,12 @@ static int write_out(settings *set, const tl_source *made, const tl_run *run, pr
     if (check_layers(set, made, &error) != TL_OK || write_grid(set, made, run, &error) != TL_OK)
         return command_failed(bar, &error);
     report(set, made, progress_end(bar));
-    if (write_layers(set, made, run, bar, &error) != TL_OK)
+    if (write_layers(set, made, run, bar, &error) != TL_OK) {
+        note_output(set);
+        for (size_t k = 0; k < set->file_count; k++) /* a failed run leaves nothing */
+            unlink(set->files[k]);
         return command_failed(bar, &error);
+    }
     warn_of_loss(set);
     return EXIT_DONE;
 }

@@ -64,10 +64,11 @@ bool command_begin(const command *self, int argc, const char **argv, bool help, 
             complain("the input's name is empty");
             result = PARSE_BAD;
         }
-    if (result == PARSE_BAD) {
-        print_usage(self);
+    if (result == PARSE_BAD || result == PARSE_FAILED) {
+        if (result == PARSE_BAD)
+            print_usage(self);
         arguments_free(rest);
-        *status = EXIT_USAGE;
+        *status = result == PARSE_BAD ? EXIT_USAGE : EXIT_FAILED;
         return false;
     }
     return true;

@@ -305,8 +305,8 @@ parse_result options_parse(const char *command, int argc, const char **argv, con
         rest->names && rest->texts && rest->before ? poptGetContext(command, argc, argv, table, 0) : NULL;
     parse_result result = context ? run_popt(context, flat, count, rest) : PARSE_BAD;
     if (!context || (result == PARSE_OK && !collect_names(context, rest))) {
-        complain("not enough memory");
-        result = PARSE_BAD;
+        complain("not enough memory for the options");
+        result = PARSE_FAILED;
     }
     if (context)
         poptFreeContext(context);

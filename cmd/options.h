@@ -48,7 +48,12 @@ typedef struct arguments {
     union option_value *before; /* what the targets held, in the order of the options */
 } arguments;
 
-typedef enum parse_result { PARSE_OK, PARSE_HELP, PARSE_BAD } parse_result;
+typedef enum parse_result {
+    PARSE_OK,
+    PARSE_HELP,
+    PARSE_BAD,
+    PARSE_FAILED /* the system did, not the user */
+} parse_result;
 
 /* Parses argv[1 ...] of the command `command`. Mistakes are told on stderr, with the accepted range and the nearest
  * name. Whatever the result, the caller frees *rest, after the last use of the options. */
