@@ -4,7 +4,9 @@
 #include "lib/base/size.h"
 #include "lib/out/tile_pyramid.h"
 
+#include <fcntl.h>
 #include <libdeflate.h>
+#include <limits.h>
 
 #include <dirent.h>
 #include <errno.h>
@@ -191,26 +193,20 @@ bool out_folder_is_complete(const out_pyramid *p, const char *text)
     return same;
 }
 
+/* Allocates nothing of its own, so that a pyramid that is complete is cleared whatever the memory. */
 void out_clear_work(const out_pyramid *p)
 {
-    char *work = out_inside(p->folder, ".talus");
-    DIR *directory = work ? opendir(work) : NULL;
-    struct dirent *entry;
-    while (directory && (entry = readdir(directory))) {
-        char *path = out_inside(work, entry->d_name);
-        if (path && entry->d_name[0] != '.' && strcmp(entry->d_name, "job.json") != 0)
-            unlink(path);
-        free(path);
-    }
-    if (directory)
-        closedir(directory);
-    char *said = out_inside(p->folder, ".talus/job.json");
-    if (said)
-        unlink(said);
-    if (work)
-        rmdir(work);
-    free(said);
-    free(work);
+    char work[PATH_MAX];
+    int length = snprintf(work, sizeof work, "%s/.talus", p->folder);
+    DIR *directory = length > 0 && length < (int)sizeof work ? opendir(work) : NULL;
+    if (!directory)
+        return;
+    for (const struct dirent *entry; (entry = readdir(directory));)
+        if (entry->d_name[0] != '.' && strcmp(entry->d_name, "job.json") != 0)
+            unlinkat(dirfd(directory), entry->d_name, 0);
+    unlinkat(dirfd(directory), "job.json", 0); /* the last, for it says what the rest is */
+    closedir(directory);
+    rmdir(work);
 }
 
 /* ---- The record ---- */

@@ -51,6 +51,7 @@ static void kernel_finish(kernel *k)
 {
     free(k->pixels);
     free(k->pool);
+    *k = (kernel){0};
 }
 
 /* The integral from a to b of the hat function around 0, which is 1 at 0 and 0 from -1 and 1 on. */
