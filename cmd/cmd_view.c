@@ -7,6 +7,7 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/stat.h>
+#include <unistd.h>
 
 typedef struct settings {
     common common;
@@ -76,8 +77,11 @@ static tl_status write_outputs(const settings *set, const tl_mesh *mesh, const l
     tl_status status = TL_OK;
     if (set->common.output)
         status = tl_write_mesh(mesh, set->common.output, &writing, error);
-    if (status == TL_OK && set->picture.picture)
+    if (status == TL_OK && set->picture.picture) {
         status = tl_view_write_picture(mesh, dem, view, 1, set->picture.picture, &look, error);
+        if (status != TL_OK && set->common.output)
+            unlink(set->common.output); /* a failed run leaves nothing */
+    }
     return status;
 }
 
