@@ -575,11 +575,12 @@ static uint16_t *known_directory(PJ_CONTEXT *context, const dem_geokeys *keys)
 
 /* libgeotiff over our checked copy of the keys, so that it neither meets unsound ones nor depends on how the process
  * has set up libtiff. */
-static PJ *crs_from_keys(PJ_CONTEXT *context, const dem_geokeys *keys, uint16_t *directory)
+static PJ *crs_from_keys(PJ_CONTEXT *context, const dem_geokeys *keys, uint16_t *directory, bool *starved)
 {
     PJ *crs = NULL;
     TIFFMethod methods;
     ST_TIFF *tags = ST_Create();
+    *starved = !tags;
     if (!tags)
         return NULL;
     ST_SetKey(tags, TIFFTAG_GEOKEYDIRECTORY, (int)keys->directory_count, STT_SHORT, directory); /* it copies */
@@ -590,6 +591,7 @@ static PJ *crs_from_keys(PJ_CONTEXT *context, const dem_geokeys *keys, uint16_t 
     GTIFSetSimpleTagsMethods(&methods);
     GTIF *gtif = GTIFNewWithMethodsEx(tags, &methods, ignore_message, NULL);
     GTIFDefn *definition = GTIFAllocDefn();
+    *starved = !definition;
     if (gtif && definition) {
         GTIFAttachPROJContext(gtif, context);
         GTIFGetDefn(gtif, definition);
@@ -661,9 +663,10 @@ static tl_status from_keys(dem_geokeys *keys, const char *path, tl_crs **out, do
     }
     dem_locale locale = dem_locale_enter();
     tl_crs *crs = NULL;
-    PJ *made = crs_from_keys(context, keys, directory);
+    bool starved;
+    PJ *made = crs_from_keys(context, keys, directory, &starved);
     free(directory);
-    tl_status status = finish(context, made, path, &crs, scale, error);
+    tl_status status = starved ? tl_fail_memory(error, path) : finish(context, made, path, &crs, scale, error);
     dem_locale_leave(locale);
     proj_context_destroy(context);
     if (status != TL_OK)
