@@ -206,15 +206,14 @@ tl_status tl_pack_mbtiles(const char *folder, const char *path, bool overwrite, 
     packing p = {.folder = folder, .path = path, .error = error};
     if (!overwrite && access(path, F_OK) == 0)
         return tl_fail(error, TL_ERROR_IO, "%s: exists already; name another file or remove it", path);
-    char *index = out_inside(folder, "layer.json"), *part = malloc(strlen(path) + sizeof ".part");
+    size_t room = strlen(path) + sizeof ".part";
+    char *index = out_inside(folder, "layer.json"), *part = malloc(room);
     json_t *layer = index ? json_load_file(index, 0, NULL) : NULL;
-    tl_status status = TL_OK;
-    if (!index || !part)
-        status = tl_fail_memory(error, path);
-    else if (!json_is_integer(json_object_get(layer, "maxzoom")))
+    tl_status status = index && part ? TL_OK : tl_fail_memory(error, path);
+    if (status == TL_OK && !json_is_integer(json_object_get(layer, "maxzoom")))
         status = tl_fail(error, TL_ERROR_DATA, "%s: is no finished folder of quantized-mesh tiles", folder);
-    if (status == TL_OK) {
-        sprintf(part, "%s.part", path);
+    if (status == TL_OK && part) {
+        snprintf(part, room, "%s.part", path);
         unlink(part);
         status = fill(&p, layer, part);
         if (status == TL_OK && rename(part, path))
