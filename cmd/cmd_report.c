@@ -122,8 +122,13 @@ static int make_report(const settings *set, const arguments *inputs, int argc, c
         status = TL_OK;
     }
     for (size_t k = 0; k < PARTS && status == TL_OK; k++)
-        if (chosen[k])
+        if (chosen[k]) {
             status = parts[k].run(&made, &error);
+            if (status == TL_ERROR_DATA || status == TL_ERROR_ARGUMENT) { /* the model is not for it; others may be */
+                report_remark(&made, parts[k].name, error.text);
+                status = TL_OK;
+            }
+        }
     if (status == TL_OK)
         status = write_all(set, &made, &error);
     size_t failures = count_failures(made.root);

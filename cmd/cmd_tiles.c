@@ -182,10 +182,11 @@ static bool output_ok(const settings *set)
 /* What is for meshes only. */
 static bool heights_ok(const settings *set)
 {
-    const char *other = set->max_error > 0 ? "error"
-                        : set->no_normals  ? "no-normals"
-                        : set->attribution ? "attribution"
-                                           : NULL;
+    const char *other = set->max_error > 0  ? "error"
+                        : set->outside != 0 ? "outside"
+                        : set->no_normals   ? "no-normals"
+                        : set->attribution  ? "attribution"
+                                            : NULL;
     if (are_heights(set) && other)
         complain("--%s is for --format quantized-mesh and 3dtiles", other);
     return !are_heights(set) || !other;

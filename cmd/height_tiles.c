@@ -104,6 +104,10 @@ static tl_status make_preset(const height_tiles *self, const common *shared, con
 static void tell(const height_tiles *self, const common *shared, const tl_grid_tiles_report *r)
 {
     uint64_t tiles = 0, bytes = 0;
+    if (r->already) {
+        command_say(shared, "%s: is complete already", shared->output);
+        return;
+    }
     for (int k = r->first_level; k <= r->last_level; k++) {
         const tl_grid_tiles_level *l = &r->levels[k];
         tiles += l->tiles;

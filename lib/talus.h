@@ -1322,6 +1322,7 @@ typedef struct tl_grid_tiles_report {
     float low, high;      /* of all tiles; NaN: none has heights */
     uint64_t done_before; /* runs of tiles that an earlier call had made */
     bool complete;        /* index.json is there */
+    bool already;         /* it was there before; nothing was done, and nothing is counted */
 } tl_grid_tiles_report;
 
 /* Cuts a source into square tiles of heights of all its levels: FOLDER/LEVEL/COLUMN_ROW.ENDING, columns from the west

@@ -318,7 +318,16 @@ static void threadsShardsAndBreaksChangeNoByte(void **state)
     assert_int_equal(tl_write_grid_tiles(source, where, &options, &report, &error), TL_ERROR_IO);
     options.resume = true;
     assert_int_equal(tl_write_grid_tiles(source, where, &options, &report, &error), TL_OK);
-    assert_true(hash_of(where, NULL) == whole);
+    assert_true(hash_of(where, NULL) == whole && !report.already);
+    assert_int_equal(tl_write_grid_tiles(source, where, &options, &report, &error), TL_OK);
+    assert_true(hash_of(where, NULL) == whole && report.already);
+    /* what shards have not done is told */
+    snprintf(where, sizeof where, "%s/early", folder);
+    options = (tl_grid_tiles_options){.tile = 5, .run = &one, .shards = 3};
+    assert_int_equal(tl_write_grid_tiles(source, where, &options, &report, &error), TL_OK);
+    options = (tl_grid_tiles_options){.tile = 5, .run = &one, .finish = true};
+    assert_int_equal(tl_write_grid_tiles(source, where, &options, &report, &error), TL_ERROR_ARGUMENT);
+    assert_non_null(strstr(error.text, "shards"));
     tl_source_destroy(source);
 }
 

@@ -40,6 +40,17 @@ json_t *report_table(json_t *section, const char *key, const char *title, const 
     return table;
 }
 
+void report_remark(report *self, const char *key, const char *text)
+{
+    char name[64];
+    json_t *sections = json_object_get(self->root, "sections");
+    snprintf(name, sizeof name, "%s_missing", key);
+    json_t *table = report_table(json_array_get(sections, json_array_size(sections) - 1), name,
+                                 "What could not be made", "The model, or a part of it, is not for this section.");
+    report_column(table, "remark", "remark", "");
+    report_text(report_row(table), "remark", text);
+}
+
 void report_column(json_t *table, const char *key, const char *title, const char *unit)
 {
     json_array_append_new(json_object_get(table, "columns"),

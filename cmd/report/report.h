@@ -26,6 +26,8 @@ typedef struct report {
 bool report_init(report *self, const char *title);
 void report_finish(report *self);
 json_t *report_section(report *self, const char *key, const char *title, const char *text);
+/* A table that says why the rest of the last section is missing. */
+void report_remark(report *self, const char *key, const char *text);
 json_t *report_table(json_t *section, const char *key, const char *title, const char *note);
 /* `unit` may be "": a count, a share or a text. */
 void report_column(json_t *table, const char *key, const char *title, const char *unit);

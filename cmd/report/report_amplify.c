@@ -141,10 +141,14 @@ static tl_status describe(const report *self, const grid *whole, int frame, cons
 static double compare_structure(const tl_statistics *a, const tl_statistics *b, int factor)
 {
     double worst = 0;
+    bool compared = false;
     for (size_t k = 0; k < a->lag_count && k < b->lag_count && a->lags[k].lag <= 2 * factor; k++)
-        for (int d = 0; d < TL_STATISTICS_DIRECTIONS; d++)
-            worst = fmax(worst, fabs(log(a->lags[k].structure[d] / b->lags[k].structure[d])));
-    return worst;
+        for (int d = 0; d < TL_STATISTICS_DIRECTIONS; d++) {
+            double off = fabs(log(a->lags[k].structure[d] / b->lags[k].structure[d]));
+            compared = compared || !isnan(off);
+            worst = fmax(worst, off);
+        }
+    return compared ? worst : (double)NAN;
 }
 
 /* The rms of the decimal logarithm of the ratio of spectra, between the coarse grid's shortest wave and the fine one's.
@@ -391,6 +395,8 @@ tl_status report_amplification(report *self, tl_error *error)
                                      "terrain would be told from ours.");
     progress_stage(self->bar, "report: amplification");
     tl_status status = choose_window(self, &window, &voids, error);
+    if (voids == UINT64_MAX)
+        voids = 0; /* nothing was looked at */
     json_t *table = status == TL_OK ? add_table(section, unit, window, voids) : NULL;
     if (status == TL_OK && window.width / 2 < LEAST_COARSE) {
         json_t *row = report_row(table);

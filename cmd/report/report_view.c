@@ -5,7 +5,7 @@
 #include <stdio.h>
 #include <string.h>
 
-enum { LEVELS = 4, FRAMES_QUICK = 12, FRAMES = 60, RUNS = 3 };
+enum { MOST_TRIANGLES = 12000000, LEVELS = 4, FRAMES_QUICK = 12, FRAMES = 60, RUNS = 3 };
 static const char *const selectors[] = {"quadtree", "chunk", "roam"};
 
 /* A scene: a model, what is made below it, and where the eye stands. */
@@ -19,26 +19,41 @@ typedef struct scene {
 
 /* ---- The scene ---- */
 
-/* The valid sample nearest to the middle, along its row and then anywhere in rows below and above. */
-static tl_status find_stand(const tl_source *dem, int64_t *i, int64_t *j, tl_error *error)
+/* Of the row nearest to the middle that has valid samples the one nearest to the middle column. */
+static tl_status find_stand(const report *self, int64_t *i, int64_t *j, tl_error *error)
 {
-    for (int64_t k = 0; k < dem->info.height; k++) {
-        int64_t row = dem->info.height / 2 + (k & 1 ? -(k + 1) / 2 : k / 2);
-        for (int64_t m = 0; row >= 0 && row < dem->info.height && m < dem->info.width; m++) {
-            int64_t column = dem->info.width / 2 + (m & 1 ? -(m + 1) / 2 : m / 2);
-            float z;
-            if (column < 0 || column >= dem->info.width)
-                continue;
-            if (tl_source_read(dem, 0, (tl_window){column, row, 1, 1}, &z, error) != TL_OK)
-                return error->status;
-            if (!isnan(z)) {
-                *i = column, *j = row;
+    const tl_source_info *info = &self->dem->info;
+    float *row = malloc((size_t)info->width * sizeof *row);
+    tl_status status = TL_OK;
+    if (!row) {
+        error->status = status = TL_ERROR_MEMORY;
+        snprintf(error->text, sizeof error->text, "the report: not enough memory for a row");
+    }
+    for (int64_t k = 0; k < 2 * info->height && status == TL_OK; k++) {
+        int64_t y = info->height / 2 + (k & 1 ? -(k + 1) / 2 : k / 2);
+        if (y < 0 || y >= info->height)
+            continue;
+        if (self->run->cancel && *self->run->cancel) {
+            error->status = TL_ERROR_CANCELLED;
+            error->text[0] = 0;
+        }
+        status = self->run->cancel && *self->run->cancel
+                     ? TL_ERROR_CANCELLED
+                     : tl_source_read(self->dem, 0, (tl_window){0, y, info->width, 1}, row, error);
+        for (int64_t m = 0; m < 2 * info->width && status == TL_OK; m++) {
+            int64_t x = info->width / 2 + (m & 1 ? -(m + 1) / 2 : m / 2);
+            if (x >= 0 && x < info->width && !isnan(row[x])) {
+                *i = x, *j = y;
+                free(row);
                 return TL_OK;
             }
         }
     }
+    free(row);
+    if (status != TL_OK)
+        return status;
     error->status = TL_ERROR_DATA;
-    snprintf(error->text, sizeof error->text, "%s: has no height to look from", dem->info.name);
+    snprintf(error->text, sizeof error->text, "%.200s: has no height to look from", info->name);
     return TL_ERROR_DATA;
 }
 
@@ -46,7 +61,7 @@ static tl_status place_eye(const report *self, tl_view *out, tl_error *error)
 {
     int64_t i = 0, j = 0;
     const tl_georef *at = &self->dem->info.georef;
-    tl_status status = find_stand(self->dem, &i, &j, error);
+    tl_status status = find_stand(self, &i, &j, error);
     if (status != TL_OK)
         return status;
     double x = (double)i, y = (double)j;
@@ -73,7 +88,7 @@ static tl_status open_scene(const report *self, scene *out, tl_error *error)
         status = error->status;
     if (status == TL_OK && !(out->pyramid = tl_pyramid_create(self->dem, &errors, error)))
         status = error->status;
-    tl_lod_options finest = {.pixel_error = .25, .run = self->run};
+    tl_lod_options finest = {.pixel_error = .25, .budget = MOST_TRIANGLES, .run = self->run};
     if (status == TL_OK)
         status = tl_select(out->field, out->dem, out->pyramid, &out->view, &finest, &out->reference, NULL, error);
     return status;
@@ -91,7 +106,7 @@ static void close_scene(scene *self)
 static tl_status add_view(const report *self, const scene *s, tl_selector selector, double asked, json_t *table,
                           tl_error *error)
 {
-    tl_lod_options options = {.selector = selector, .pixel_error = asked, .run = self->run};
+    tl_lod_options options = {.selector = selector, .pixel_error = asked, .budget = MOST_TRIANGLES, .run = self->run};
     tl_mesh *mesh = NULL;
     tl_lod_stats stats;
     tl_view_report found;
@@ -191,12 +206,18 @@ static tl_status add_flight(const report *self, const scene *s, json_t *section,
         return error->status;
     tl_view view = s->view;
     bool degrees = s->dem->info.georef.crs && s->dem->info.georef.located;
-    double step = .01 * view.eye[2] * (degrees ? 1 / 111320. : 1 / s->dem->info.georef.cell_y);
+    double step = .01 * view.eye[2] *
+                  (degrees ? fabs(s->dem->info.georef.transform[5]) / s->dem->info.georef.cell_y
+                           : 1 / s->dem->info.georef.cell_y);
     size_t frames = self->quick ? FRAMES_QUICK : FRAMES;
     tl_status status = TL_OK;
     for (size_t k = 0; k < frames && status == TL_OK; k++) {
         tl_lod_stats stats;
         status = tl_roam_look(roam, &view, &stats, error);
+        if (status == TL_ERROR_DATA || (status == TL_ERROR_ARGUMENT && k)) { /* the rim, or a void */
+            status = TL_OK;
+            break;
+        }
         if (status == TL_OK)
             add_frame(table, k, &stats);
         view.eye[1] += step;
@@ -213,7 +234,7 @@ static tl_status add_flight(const report *self, const scene *s, json_t *section,
 static tl_status add_scene(const report *self, const scene *s, const char *name, unsigned keep, json_t *table,
                            tl_error *error)
 {
-    tl_lod_options options = {.pixel_error = 1, .keep = keep, .run = self->run};
+    tl_lod_options options = {.pixel_error = 1, .budget = MOST_TRIANGLES, .keep = keep, .run = self->run};
     tl_mesh *mesh = NULL;
     tl_lod_stats stats;
     tl_status status = tl_select(s->field, s->dem, s->pyramid, &s->view, &options, &mesh, &stats, error);

@@ -62,7 +62,8 @@ typedef struct job {
     out_coding code;
     tl_source *turned; /* the north first, where the source is otherwise */
     level levels[TL_GRID_TILES_LEVELS];
-    run *runs; /* from the deepest level up */
+    char *text; /* what parts of a run must agree on */
+    run *runs;  /* from the deepest level up */
     size_t run_count;
     out_pyramid work; /* what the folder's keeping needs */
     tl_tiles_options flags;
@@ -83,9 +84,10 @@ static tl_status check_options(const tl_grid_tiles_options *o, const char *folde
                        (long long)o->tile);
     if (o->shards && o->shard >= o->shards)
         return tl_fail(error, TL_ERROR_ARGUMENT, "%s: there is no shard %u of %u", folder, o->shard, o->shards);
-    if (o->range_given && !(o->low < o->high && isfinite(o->low) && isfinite(o->high)))
-        return tl_fail(error, TL_ERROR_ARGUMENT, "%s: the range of heights must rise, not go from %g to %g", folder,
-                       o->low, o->high);
+    if (o->range_given && !((float)o->low < (float)o->high && isfinite((float)o->low) && isfinite((float)o->high)))
+        return tl_fail(error, TL_ERROR_ARGUMENT,
+                       "%s: the range of heights (--range) must rise, in single precision, not go from %g to %g",
+                       folder, o->low, o->high);
     return TL_OK;
 }
 
@@ -376,15 +378,25 @@ static tl_status make_runs(job *j, tl_error *error)
         run *r = &j->runs[k];
         r->done = (o->resume || o->shards || o->finish) && load_run(j, r);
         j->report->done_before += r->done;
-        if (!r->done && (!o->shards || o->finish || k % o->shards == o->shard))
+        if (!r->done && (!o->shards || k % o->shards == o->shard))
             m.todo[count++] = k;
+    }
+    if (m.todo && o->finish && !o->resume && count) {
+        free(m.todo);
+        return tl_fail(
+            error, TL_ERROR_ARGUMENT,
+            "%s: %zu of its %zu runs of tiles are not done; run the shards first, or finish all with --resume",
+            j->folder, count, j->run_count);
     }
     uint64_t side = (uint64_t)j->cells + 1, samples = count * RUN * side * side;
     tl_status status = m.todo ? make_folders(j, error) : tl_fail_memory(error, j->folder);
+    double tile = COPIES * (double)(side * side) * sizeof(float);
+    unsigned most = tl_parallel_workers(o->run, count);
+    if (workers.memory && tile * most > (double)workers.memory) /* as many as there is room for */
+        most = (double)workers.memory >= tile ? (unsigned)((double)workers.memory / tile) : 1;
+    workers.threads = most;
     if (status == TL_OK)
-        status = tl_run_fits(
-            o->run, (double)tl_parallel_workers(o->run, count) * COPIES * (double)(side * side) * sizeof(float),
-            j->source->info.name, "cutting it into tiles", error);
+        status = tl_run_fits(o->run, tile, j->source->info.name, "cutting it into tiles", error);
     if (status == TL_OK)
         status = tl_parallel_for(&workers, count, samples, make_run, &m, error);
     free(m.todo);
@@ -442,6 +454,7 @@ static json_t *describe(const job *j)
         is_coded(j) ? json_real(j->code.offset) : json_real(0), "void", is_coded(j) ? json_integer(0) : json_null(),
         "bounds_degrees", placed ? numbers(bounds, 4) : json_null());
     json_object_set_new(root, "levels", levels);
+    json_object_set_new(root, "talus", json_pack("{s:o?}", "job", json_loads(j->text, 0, NULL)));
     out_json_add_record(root, info);
     return root;
 }
@@ -473,7 +486,7 @@ static tl_status finish(job *j, tl_error *error)
     if (!all)
         return TL_OK;
     json_t *root = describe(j);
-    char *text = root ? json_dumps(root, JSON_INDENT(1) | JSON_REAL_PRECISION(9)) : NULL;
+    char *text = root ? json_dumps(root, JSON_INDENT(1) | JSON_REAL_PRECISION(17)) : NULL;
     tl_status status = text ? out_write_inside(j->folder, "index.json", text, strlen(text), true, error)
                             : tl_fail_memory(error, j->folder);
     free(text);
@@ -507,16 +520,18 @@ static char *describe_job(const job *j, uint32_t sum)
 static tl_status begin(job *j, tl_error *error)
 {
     uint32_t sum;
+    static const out_scheme scheme = {.index = "index.json"};
     tl_status status = out_sum_rows(j->source, &sum, error);
-    char *text = status == TL_OK ? describe_job(j, sum) : NULL;
-    if (status == TL_OK && !text)
+    j->text = status == TL_OK ? describe_job(j, sum) : NULL;
+    if (status == TL_OK && !j->text)
         status = tl_fail_memory(error, j->folder);
     j->flags =
         (tl_tiles_options){.resume = j->options->resume, .shards = j->options->shards, .finish = j->options->finish};
-    j->work = (out_pyramid){.folder = j->folder, .source = j->source, .options = &j->flags};
-    if (status == TL_OK)
-        status = out_begin_folder(&j->work, text, error);
-    free(text);
+    j->work = (out_pyramid){.folder = j->folder, .source = j->source, .options = &j->flags, .scheme = &scheme};
+    if (status == TL_OK && (j->flags.resume || j->flags.shards || j->flags.finish))
+        j->report->already = j->report->complete = out_folder_is_complete(&j->work, j->text);
+    if (status == TL_OK && !j->report->complete)
+        status = out_begin_folder(&j->work, j->text, error);
     return status;
 }
 
@@ -534,8 +549,9 @@ static tl_status work(job *j, tl_error *error)
         status = list_runs(j, error);
     if (status == TL_OK)
         status = begin(j, error);
-    if (status == TL_OK)
-        status = make_runs(j, error);
+    if (status != TL_OK || j->report->complete)
+        return status;
+    status = make_runs(j, error);
     return status == TL_OK ? finish(j, error) : status;
 }
 
@@ -554,6 +570,7 @@ tl_status tl_write_grid_tiles(const tl_source *source, const char *folder, const
         tl_source_destroy(j.levels[k].source);
     tl_source_destroy(j.turned);
     free(j.runs);
+    free(j.text);
     if (out)
         *out = report;
     return status;
