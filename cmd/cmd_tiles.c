@@ -4,6 +4,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <unistd.h>
 
 static const char *const formats[] = {[TL_TILES_QUANTIZED_MESH] = "quantized-mesh",
                                       [TL_TILES_3D] = "3dtiles",
@@ -140,6 +141,10 @@ static const tl_source *refine(const settings *set, const tl_source *dem, const 
 
 static int make_tiles(const settings *set, const arguments *inputs, tl_tiles_options *options)
 {
+    if (set->mbtiles && access(set->mbtiles, F_OK) == 0) { /* told before the work */
+        complain("%s: exists already; name another file or remove it", set->mbtiles);
+        return EXIT_FAILED;
+    }
     progress bar;
     tl_error error;
     tl_tiles_report made;

@@ -93,9 +93,12 @@ static tl_status make_preset(const height_tiles *self, const common *shared, con
     }
     if (tl_write_preset(source, path, &options, &made, error) != TL_OK)
         return error->status;
-    command_say(shared, "%s: %lld x %lld tiles of %lld x %lld samples, heights from %g to %g", self->preset,
-                (long long)made.columns, (long long)made.rows, (long long)made.tile_width, (long long)made.tile_height,
-                (double)made.low, (double)made.high);
+    command_say(shared,
+                "%s: %lld x %lld tiles of %lld x %lld samples, %lld x %lld of %lld x %lld from the middle, heights "
+                "from %g to %g",
+                self->preset, (long long)made.columns, (long long)made.rows, (long long)made.tile_width,
+                (long long)made.tile_height, (long long)made.window.width, (long long)made.window.height,
+                (long long)source->info.width, (long long)source->info.height, (double)made.low, (double)made.high);
     for (char *rest, *line = strtok_r(made.import, "\n", &rest); line; line = strtok_r(NULL, "\n", &rest))
         command_say(shared, "  %s", line);
     return TL_OK;

@@ -11,7 +11,7 @@
 typedef struct index_file {
     char *path;
     json_t *root;
-    const char *format; /* "quantized-mesh", "3dtiles" or "preset"; NULL: another */
+    const char *format; /* "quantized-mesh", "3dtiles", "heights" or "preset"; NULL: another */
 } index_file;
 
 static const char *format_of(const json_t *root)
@@ -20,6 +20,8 @@ static const char *format_of(const json_t *root)
         return "quantized-mesh";
     if (json_object_get(json_object_get(root, "asset"), "version") && json_object_get(root, "geometricError"))
         return "3dtiles";
+    if (json_is_string(json_object_get(root, "names")) && json_is_array(json_object_get(root, "levels")))
+        return "heights";
     return json_is_string(json_object_get(root, "preset")) && json_is_array(json_object_get(root, "tiles")) ? "preset"
                                                                                                             : NULL;
 }
@@ -64,7 +66,8 @@ static bool find_index(const char *path, index_file *out)
     struct stat status;
     size_t length = strlen(path);
     if (stat(path, &status) == 0 && S_ISDIR(status.st_mode))
-        return try_file(path, length, "/layer.json", out) || try_file(path, length, "/tileset.json", out);
+        return try_file(path, length, "/layer.json", out) || try_file(path, length, "/tileset.json", out) ||
+               try_file(path, length, "/index.json", out);
     if (command_ends_with(path, ".json"))
         return try_file(path, length, "", out);
     if (!command_ends_with(path, ".r16") && !command_ends_with(path, ".png"))
@@ -126,11 +129,34 @@ static json_t *record_of(const index_file *index)
 {
     json_t *record = json_object(), *talus = json_object_get(index->root, "talus");
     talus = talus ? talus : json_object_get(json_object_get(index->root, "extras"), "talus");
-    add_texts(record, talus ? talus : json_object_get(index->root, "parameters"));
+    bool own = talus && strcmp(index->format, "heights") != 0;
+    add_texts(record, own ? talus : json_object_get(index->root, "parameters"));
     const json_t *errors = json_object_get(talus, "errors");
     if (json_array_size(errors))
         add_text(record, "error_of_the_deepest_level", json_array_get(errors, json_array_size(errors) - 1));
     return record;
+}
+
+static void describe_heights(const json_t *root, json_t *out)
+{
+    const json_t *levels = json_object_get(root, "levels"), *range = json_object_get(root, "range");
+    const json_t *last = json_array_get(levels, json_array_size(levels) - 1);
+    double tiles = 0;
+    size_t k;
+    const json_t *level;
+    json_array_foreach(levels, k, level) tiles += (double)json_array_size(json_object_get(level, "tiles"));
+    json_object_set_new(out, "tiles", json_integer((json_int_t)tiles));
+    json_object_set_new(
+        out, "levels", json_pack("[i,i]", (int)number(json_array_get(levels, 0), "level"), (int)number(last, "level")));
+    json_object_set(out, "names", json_object_get(root, "names"));
+    json_object_set(out, "width", json_object_get(last, "width"));
+    json_object_set(out, "height", json_object_get(last, "height"));
+    json_object_set(out, "tile_width", json_object_get(root, "tile"));
+    json_object_set(out, "tile_height", json_object_get(root, "tile"));
+    json_object_set(out, "lowest", json_array_get(range, 0));
+    json_object_set(out, "highest", json_array_get(range, 1));
+    json_object_set(out, "scale", json_object_get(root, "scale"));
+    json_object_set(out, "offset", json_object_get(root, "offset"));
 }
 
 static json_t *describe(const char *path, const index_file *index)
@@ -146,6 +172,8 @@ static json_t *describe(const char *path, const index_file *index)
         json_object_set(out, "bounds", json_object_get(root, "bounds"));
     } else if (strcmp(index->format, "3dtiles") == 0)
         json_object_set_new(out, "geometric_error", json_real(number(root, "geometricError")));
+    else if (strcmp(index->format, "heights") == 0)
+        describe_heights(root, out);
     else {
         json_object_set_new(out, "tiles", json_integer((json_int_t)json_array_size(json_object_get(root, "tiles"))));
         json_object_set(out, "preset", json_object_get(root, "preset"));
@@ -178,8 +206,17 @@ static void print_head(const char *path, const index_file *index, const json_t *
                json_number_value(json_array_get(bounds, 2)), json_number_value(json_array_get(bounds, 1)),
                json_number_value(json_array_get(bounds, 3)));
     } else if (strcmp(index->format, "3dtiles") == 0)
-        printf("\ntiles        3D Tiles, off by %.6g m without any\n", number(about, "geometric_error"));
-    else {
+        printf("\ntiles        3D Tiles; the error where none is shown is %.6g m\n", number(about, "geometric_error"));
+    else if (strcmp(index->format, "heights") == 0) {
+        printf("\ntiles        %.0f of %.0f x %.0f samples, ", number(about, "tiles"), number(about, "tile_width"),
+               number(about, "tile_height"));
+        print_plain(json_is_string(json_object_get(about, "names")) ? json_string_value(json_object_get(about, "names"))
+                                                                    : "?");
+        printf(
+            ", levels %.0f to %.0f\nsize         %.0f x %.0f samples of the last level\nheights      %.9g ... %.9g\n",
+            json_number_value(json_array_get(levels, 0)), json_number_value(json_array_get(levels, 1)),
+            number(about, "width"), number(about, "height"), number(about, "lowest"), number(about, "highest"));
+    } else {
         printf("\ntiles        %.0f of %.0f x %.0f samples for ", number(about, "tiles"), number(about, "tile_width"),
                number(about, "tile_height"));
         print_plain(json_string_value(json_object_get(about, "preset")));

@@ -454,6 +454,7 @@ static json_t *describe(const job *j)
         is_coded(j) ? json_real(j->code.offset) : json_real(0), "void", is_coded(j) ? json_integer(0) : json_null(),
         "bounds_degrees", placed ? numbers(bounds, 4) : json_null());
     json_object_set_new(root, "levels", levels);
+    info = j->turned ? &j->turned->info : info; /* rows from the north, as in the tiles */
     json_object_set_new(root, "talus", json_pack("{s:o?}", "job", json_loads(j->text, 0, NULL)));
     out_json_add_record(root, info);
     return root;
