@@ -77,7 +77,8 @@ static tl_status write_all(const settings *set, report *made, tl_error *error)
         status = report_write_page(made, plots, error);
     json_decref(plots);
     if (status == TL_OK && !drawn)
-        command_say(&set->common, "warning: gnuplot was not found, so the page has no pictures; install gnuplot-nox");
+        command_say(&set->common,
+                    "warning: gnuplot is not there or failed, so pictures are missing; install gnuplot-nox");
     return status;
 }
 

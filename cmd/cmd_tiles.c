@@ -170,6 +170,8 @@ static int make_tiles(const settings *set, const arguments *inputs, tl_tiles_opt
         report(set, &made, progress_end(&bar));
         if (set->mbtiles && made.complete && tl_pack_mbtiles(set->common.output, set->mbtiles, false, &error) != TL_OK)
             status = command_failed(&bar, &error);
+        else if (set->mbtiles && made.complete)
+            command_say(&set->common, "%s: all tiles, in one file", set->mbtiles);
     }
     tl_source_destroy(field);
     command_close(&opened);
@@ -278,7 +280,7 @@ static int run_tiles(const command *self, int argc, const char **argv, bool help
     bool good = output_ok(&set) && format_ok(&set) && read_levels(set.levels, &options) &&
                 read_shard(set.shard, &options) && heights_ok(&set) &&
                 height_tiles_ok(&set.heights, formats[set.format], &options) &&
-                (!set.layers || command_texture_names(set.layers, &options.textures));
+                (!set.layers || command_texture_names("layers", set.layers, &options.textures));
     status = good ? make_tiles(&set, &rest, &options) : EXIT_USAGE;
     arguments_free(&rest);
     return status;

@@ -251,7 +251,7 @@ bool command_ends_with(const char *path, const char *ending)
     return length > end && strcasecmp(path + length - end, ending) == 0;
 }
 
-bool command_texture_names(const char *text, unsigned *out)
+bool command_texture_names(const char *name, const char *text, unsigned *out)
 {
     static const char *const names[] = {"colour", "normal"}; /* by tl_texture's bits */
     const char *at = text;
@@ -264,7 +264,7 @@ bool command_texture_names(const char *text, unsigned *out)
         if (k == 2) {
             char word[32];
             snprintf(word, sizeof word, "%.*s", (int)length, at);
-            complain_of_choice("texture", word, names, 2, sizeof *names);
+            complain_of_choice(name, word, names, 2, sizeof *names);
             return false;
         }
         *out |= 1u << k;
@@ -282,7 +282,7 @@ bool command_textures(const common *options, unsigned *out)
         complain(at ? "--texture is for .glb; other formats have none" : "--texture-size is for --texture KINDS");
         return false;
     }
-    return command_texture_names(at, out);
+    return command_texture_names("texture", at, out);
 }
 
 bool command_split_ok(const common *options)

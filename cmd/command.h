@@ -239,7 +239,7 @@ bool command_split_ok(const common *options);
  */
 bool command_textures(const common *options, unsigned *out);
 /* The same of a list of names. */
-bool command_texture_names(const char *names, unsigned *out);
+bool command_texture_names(const char *name, const char *kinds, unsigned *out);
 bool command_ends_with(const char *path, const char *ending);
 
 /* Whether an output was named and has an ending that talus writes as `grid` or `mesh`; else told. */

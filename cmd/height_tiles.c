@@ -5,18 +5,22 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/stat.h>
+#include <unistd.h>
 
 const char *const height_tile_compressions[] = {
     [TL_COMPRESSION_DEFAULT] = "default", [TL_COMPRESSION_NONE] = "none", [TL_COMPRESSION_ZIP] = "zip",
     [TL_COMPRESSION_ZIPS] = "zips",       [TL_COMPRESSION_PIZ] = "piz",   [TL_COMPRESSION_DEFLATE] = "deflate",
     [TL_COMPRESSION_ZSTD] = "zstd",       [TL_COMPRESSION_LZW] = "lzw",   NULL};
 
-static const char *const endings[] = {[TL_GRID_TILES_EXR] = "exr",
-                                      [TL_GRID_TILES_TIFF] = "tif",
-                                      [TL_GRID_TILES_PNG16] = "png",
-                                      [TL_GRID_TILES_R16] = "r16",
-                                      [TL_GRID_TILES_RAW] = "raw"};
-enum { ENDINGS = sizeof endings / sizeof *endings };
+/* Whether there is such a preset, and its program takes such files. */
+static bool takes(const char *preset, const char *format)
+{
+    const tl_preset *p = tl_presets();
+    while (p->name && strcmp(p->name, preset) != 0)
+        p++;
+    const char *found = p->name ? strstr(p->endings, format) : NULL;
+    return found && strchr(" ", found[strlen(format)]);
+}
 
 static bool preset_ok(const height_tiles *self, const char *format, const tl_tiles_options *parts)
 {
@@ -26,8 +30,8 @@ static bool preset_ok(const height_tiles *self, const char *format, const tl_til
         complain("--preset makes one level at once; leave --levels, --resume, --shard, --finish and --dry-run away");
     else if (self->range || self->compression)
         complain("--preset decides how files are written; leave --range and --compression away");
-    else if (strcmp(format, "tif") == 0 || strcmp(format, "raw") == 0)
-        complain("no program that has a preset takes %s; give --format png, r16 or exr", format);
+    else if (!takes(self->preset, format))
+        complain("--preset %s does not take --format %s, or is none; see 'talus help synth'", self->preset, format);
     else
         return true;
     return false;
@@ -36,11 +40,12 @@ static bool preset_ok(const height_tiles *self, const char *format, const tl_til
 bool height_tiles_ok(height_tiles *self, const char *format, const tl_tiles_options *parts)
 {
     tl_grid_tiles_options *o = &self->options;
-    size_t kind = 0;
+    int kind = 0;
     char rest;
-    while (kind < ENDINGS && strcmp(endings[kind], format) != 0)
+    const char *ending;
+    while ((ending = tl_grid_tiles_ending((tl_grid_tiles_format)kind)) && strcmp(ending, format) != 0)
         kind++;
-    if (kind == ENDINGS) {
+    if (!ending) {
         if (self->tile || self->range || self->compression || self->preset)
             complain("--%s is for tiles of heights: --format exr, tif, png, r16 or raw", self->tile    ? "tile"
                                                                                          : self->range ? "range"
@@ -86,13 +91,17 @@ static tl_status make_preset(const height_tiles *self, const common *shared, con
     const char *slash = strrchr(folder, '/'), *name = slash ? slash + 1 : folder;
     bool good = *name && strcmp(name, ".") != 0 && strcmp(name, "..") != 0;
     snprintf(path, sizeof path, "%s/%s.%s", folder, good ? name : "terrain", format);
-    if (mkdir(folder, 0777) && errno != EEXIST) {
+    bool made_folder = mkdir(folder, 0777) == 0;
+    if (!made_folder && errno != EEXIST) {
         error->status = TL_ERROR_IO;
         snprintf(error->text, sizeof error->text, "%.200s: cannot be made a folder: %s", folder, strerror(errno));
         return TL_ERROR_IO;
     }
-    if (tl_write_preset(source, path, &options, &made, error) != TL_OK)
+    if (tl_write_preset(source, path, &options, &made, error) != TL_OK) {
+        if (made_folder)
+            rmdir(folder);
         return error->status;
+    }
     command_say(shared,
                 "%s: %lld x %lld tiles of %lld x %lld samples, %lld x %lld of %lld x %lld from the middle, heights "
                 "from %g to %g",

@@ -1293,6 +1293,9 @@ typedef enum tl_grid_tiles_format {
 
 enum { TL_GRID_TILES_LEVELS = 40 };
 
+/* What the names of its files end with, "exr"; NULL: there is no such format, nor any behind it. */
+TL_API const char *tl_grid_tiles_ending(tl_grid_tiles_format format);
+
 typedef struct tl_grid_tiles_options {
     tl_grid_tiles_format format;
     int64_t tile; /* samples on a side, odd: neighbours share their outermost ones; 0: 257 */

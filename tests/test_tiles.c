@@ -826,9 +826,9 @@ static void otherJobsAreRefused(void **state)
     options.outside = 0;
     assert_true(write_tiles(source, where, &options).complete);
     options.max_error *= 2;
-    expect_refused(source, where, &options, "not empty");
+    expect_refused(source, where, &options, "finished tiles");
     options.resume = false;
-    expect_refused(source, where, &options, "not empty");
+    expect_refused(source, where, &options, "finished tiles");
     remove_tree(where);
     free(where);
     close_ground(source, heights);

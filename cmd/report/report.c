@@ -70,6 +70,12 @@ void report_text(json_t *row, const char *key, const char *text)
     json_object_set_new(row, key, value ? value : json_string("?"));
 }
 
+const char *report_text_of(const json_t *object, const char *key)
+{
+    const char *text = json_string_value(json_object_get(object, key));
+    return text ? text : "";
+}
+
 void report_number(json_t *row, const char *key, double value)
 {
     bool whole = value == floor(value) && fabs(value) < 1e15;

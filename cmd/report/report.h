@@ -36,6 +36,9 @@ void report_text(json_t *row, const char *key, const char *text);
 /* Null where it is not finite. */
 void report_number(json_t *row, const char *key, double value);
 
+/* A member that is a text; "" where it is none. */
+const char *report_text_of(const json_t *object, const char *key);
+
 /* A curve for each text of the column `series`, or one where it is NULL. */
 typedef struct report_plot {
     const char *key, *title, *x, *y, *series;

@@ -53,12 +53,6 @@ static void put(FILE *out, const char *text)
         }
 }
 
-static const char *text_of(const json_t *object, const char *key)
-{
-    const char *text = json_string_value(json_object_get(object, key));
-    return text ? text : "";
-}
-
 /* Four significant digits; whole numbers in groups of three. */
 static void put_number(FILE *out, double value)
 {
@@ -105,12 +99,12 @@ static void put_heads(FILE *out, const json_t *table)
     fputs("<thead><tr>", out);
     json_array_foreach(json_object_get(table, "columns"), k, column)
     {
-        bool text = json_is_string(json_object_get(first, text_of(column, "key")));
+        bool text = json_is_string(json_object_get(first, report_text_of(column, "key")));
         fprintf(out, "<th%s>", text ? " class=\"text\"" : "");
-        put(out, text_of(column, "title"));
-        if (*text_of(column, "unit")) {
+        put(out, report_text_of(column, "title"));
+        if (*report_text_of(column, "unit")) {
             fputs("<br><small>", out);
-            put(out, text_of(column, "unit"));
+            put(out, report_text_of(column, "unit"));
             fputs("</small>", out);
         }
         fputs("</th>", out);
@@ -123,22 +117,22 @@ static void put_table(FILE *out, const json_t *table, const json_t *plots)
     size_t k, c;
     const json_t *row, *column, *plot;
     fputs("<h3>", out);
-    put(out, text_of(table, "title"));
+    put(out, report_text_of(table, "title"));
     fputs("</h3>\n", out);
-    if (*text_of(table, "note")) {
+    if (*report_text_of(table, "note")) {
         fputs("<p class=\"note\">", out);
-        put(out, text_of(table, "note"));
+        put(out, report_text_of(table, "note"));
         fputs("</p>\n", out);
     }
     json_array_foreach(json_object_get(table, "plots"), k, plot)
     {
-        const char *picture = json_string_value(json_object_get(plots, text_of(plot, "key")));
+        const char *picture = json_string_value(json_object_get(plots, report_text_of(plot, "key")));
         if (picture) {
             fputs("<figure>", out);
             fputs(picture, out);
             fputs("<figcaption>", out);
-            put(out, text_of(plot, "title"));
-            fprintf(out, " (%s.csv)</figcaption></figure>\n", text_of(plot, "key"));
+            put(out, report_text_of(plot, "title"));
+            fprintf(out, " (%s.csv)</figcaption></figure>\n", report_text_of(plot, "key"));
         }
     }
     fputs("<div class=\"wide\"><table>\n", out);
@@ -146,10 +140,10 @@ static void put_table(FILE *out, const json_t *table, const json_t *plots)
     fputs("<tbody>\n", out);
     json_array_foreach(json_object_get(table, "rows"), k, row)
     {
-        bool failed = strcmp(text_of(row, "verdict"), "failed") == 0;
+        bool failed = strcmp(report_text_of(row, "verdict"), "failed") == 0;
         fputs(failed ? "<tr class=\"failed\">" : "<tr>", out);
         json_array_foreach(json_object_get(table, "columns"), c, column)
-            put_value(out, json_object_get(row, text_of(column, "key")));
+            put_value(out, json_object_get(row, report_text_of(column, "key")));
         fputs("</tr>\n", out);
     }
     fputs("</tbody></table></div>\n", out);
@@ -190,14 +184,14 @@ static void put_page(FILE *out, const json_t *root, const json_t *plots)
     const json_t *section, *table;
     fputs(head, out);
     fputs("<title>", out);
-    put(out, text_of(root, "title"));
+    put(out, report_text_of(root, "title"));
     fputs("</title>\n</head>\n<body>\n<h1>", out);
-    put(out, text_of(root, "title"));
+    put(out, report_text_of(root, "title"));
     fputs("</h1>\n<nav><ol>\n", out);
     json_array_foreach(json_object_get(root, "sections"), k, section)
     {
-        fprintf(out, "<li><a href=\"#%s\">", text_of(section, "key"));
-        put(out, text_of(section, "title"));
+        fprintf(out, "<li><a href=\"#%s\">", report_text_of(section, "key"));
+        put(out, report_text_of(section, "title"));
         fputs("</a></li>\n", out);
     }
     fputs("</ol></nav>\n<div class=\"wide\"><table><tbody>\n", out);
@@ -210,10 +204,10 @@ static void put_page(FILE *out, const json_t *root, const json_t *plots)
           out);
     json_array_foreach(json_object_get(root, "sections"), k, section)
     {
-        fprintf(out, "<section>\n<h2 id=\"%s\">%zu. ", text_of(section, "key"), k + 1);
-        put(out, text_of(section, "title"));
+        fprintf(out, "<section>\n<h2 id=\"%s\">%zu. ", report_text_of(section, "key"), k + 1);
+        put(out, report_text_of(section, "title"));
         fputs("</h2>\n<p>", out);
-        put(out, text_of(section, "text"));
+        put(out, report_text_of(section, "text"));
         fputs("</p>\n", out);
         json_array_foreach(json_object_get(section, "tables"), t, table) put_table(out, table, plots);
         fputs("</section>\n", out);

@@ -14,18 +14,12 @@ extern char **environ;
 
 enum { SERIES = 32 };
 
-static const char *text_of(const json_t *object, const char *key)
-{
-    const char *text = json_string_value(json_object_get(object, key));
-    return text ? text : "";
-}
-
 static const json_t *column_of(const json_t *table, const char *key)
 {
     size_t k;
     const json_t *column;
     json_array_foreach(json_object_get(table, "columns"), k,
-                       column) if (strcmp(text_of(column, "key"), key) == 0) return column;
+                       column) if (strcmp(report_text_of(column, "key"), key) == 0) return column;
     return NULL;
 }
 
@@ -53,7 +47,7 @@ static size_t list_series(const json_t *table, const char *key, const char *out[
     }
     json_array_foreach(json_object_get(table, "rows"), k, row)
     {
-        const char *name = text_of(row, key);
+        const char *name = report_text_of(row, key);
         size_t at = 0;
         while (at < count && strcmp(out[at], name) != 0)
             at++;
@@ -83,7 +77,8 @@ static void put_csv(FILE *out, const json_t *table, const json_t *plot)
 {
     size_t k;
     const json_t *row;
-    const char *keys[] = {text_of(plot, "x"), text_of(plot, "y")}, *series = text_of(plot, "series");
+    const char *keys[] = {report_text_of(plot, "x"), report_text_of(plot, "y")},
+               *series = report_text_of(plot, "series");
     fprintf(out, "%s%s%s,%s,%s_low,%s_high,count\n", series, *series ? "," : "", keys[0], keys[1], keys[1], keys[1]);
     json_array_foreach(json_object_get(table, "rows"), k, row)
     {
@@ -92,7 +87,7 @@ static void put_csv(FILE *out, const json_t *table, const json_t *plot)
         if (!numbers_of(json_object_get(row, keys[0]), x) || !numbers_of(value, y))
             continue;
         if (*series) {
-            put_field(out, text_of(row, series));
+            put_field(out, report_text_of(row, series));
             fputc(',', out);
         }
         const json_t *count = json_object_get(value, "count");
@@ -119,8 +114,8 @@ static void put_label(FILE *out, const json_t *table, const char *axis, const ch
 {
     char label[256];
     const json_t *column = column_of(table, key);
-    const char *unit = text_of(column, "unit");
-    snprintf(label, sizeof label, *unit ? "%s, %s" : "%s", text_of(column, "title"), unit);
+    const char *unit = report_text_of(column, "unit");
+    snprintf(label, sizeof label, *unit ? "%s, %s" : "%s", report_text_of(column, "title"), unit);
     fprintf(out, "set %slabel ", axis);
     put_quoted(out, label);
     fputc('\n', out);
@@ -131,14 +126,14 @@ static size_t put_points(FILE *out, const json_t *table, const json_t *plot, con
 {
     size_t k, count = 0;
     const json_t *row;
-    const char *series = text_of(plot, "series");
+    const char *series = report_text_of(plot, "series");
     bool logs[2] = {json_is_true(json_object_get(plot, "log_x")), json_is_true(json_object_get(plot, "log_y"))};
     json_array_foreach(json_object_get(table, "rows"), k, row)
     {
         double x[3], y[3];
-        if ((*series && strcmp(text_of(row, series), name) != 0) ||
-            !numbers_of(json_object_get(row, text_of(plot, "x")), x) ||
-            !numbers_of(json_object_get(row, text_of(plot, "y")), y) || (logs[0] && !(x[0] > 0)) ||
+        if ((*series && strcmp(report_text_of(row, series), name) != 0) ||
+            !numbers_of(json_object_get(row, report_text_of(plot, "x")), x) ||
+            !numbers_of(json_object_get(row, report_text_of(plot, "y")), y) || (logs[0] && !(x[0] > 0)) ||
             (logs[1] && !(y[1] > 0)))
             continue;
         fprintf(out, "%.9g %.9g %.9g %.9g\n", x[0], y[0], y[1], y[2]);
@@ -150,14 +145,14 @@ static size_t put_points(FILE *out, const json_t *table, const json_t *plot, con
 static void put_script(FILE *out, const json_t *table, const json_t *plot)
 {
     const char *names[SERIES];
-    size_t count = list_series(table, text_of(plot, "series"), names), drawn[SERIES];
+    size_t count = list_series(table, report_text_of(plot, "series"), names), drawn[SERIES];
     fputs("set terminal svg size 660,420 dynamic noenhanced font \"sans-serif,12\" linewidth 1.2\n"
           "set encoding utf8\nset grid lc rgb \"#cccccc\" lw 0.5\nset key outside right top\nset border 3\nset tics "
           "nomirror\n",
           out);
-    fprintf(out, "set terminal svg name \"%s\"\n", text_of(plot, "key"));
-    put_label(out, table, "x", text_of(plot, "x"));
-    put_label(out, table, "y", text_of(plot, "y"));
+    fprintf(out, "set terminal svg name \"%s\"\n", report_text_of(plot, "key"));
+    put_label(out, table, "x", report_text_of(plot, "x"));
+    put_label(out, table, "y", report_text_of(plot, "y"));
     if (json_is_true(json_object_get(plot, "log_x")))
         fputs("set logscale x\nset format x \"%.3g\"\n", out);
     if (json_is_true(json_object_get(plot, "log_y")))
@@ -249,7 +244,7 @@ static tl_status write_csv(const report *self, const json_t *table, const json_t
 {
     char name[256], *text = NULL;
     size_t length;
-    snprintf(name, sizeof name, "%s.csv", text_of(plot, "key"));
+    snprintf(name, sizeof name, "%s.csv", report_text_of(plot, "key"));
     FILE *out = open_memstream(&text, &length);
     if (out)
         put_csv(out, table, plot);
@@ -275,9 +270,9 @@ tl_status report_draw(const report *self, json_t *plots, bool *drawn, tl_error *
     {
         if (write_csv(self, table, plot, error) != TL_OK)
             return error->status;
-        json_t *picture = *drawn ? draw(table, plot) : NULL;
+        json_t *picture = draw(table, plot);
         if (picture)
-            json_object_set_new(plots, text_of(plot, "key"), picture);
+            json_object_set_new(plots, report_text_of(plot, "key"), picture);
         else
             *drawn = false;
     }

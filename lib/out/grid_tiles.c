@@ -31,6 +31,11 @@ static const char *const endings[] = {[TL_GRID_TILES_EXR] = "exr",
                                       [TL_GRID_TILES_R16] = "r16",
                                       [TL_GRID_TILES_RAW] = "raw"};
 
+const char *tl_grid_tiles_ending(tl_grid_tiles_format format)
+{
+    return (size_t)format < sizeof endings / sizeof *endings ? endings[format] : NULL;
+}
+
 /* A tile that is there; bytes 0: it is void, and there is no file. */
 typedef struct tile_record {
     int64_t bytes;
@@ -332,14 +337,14 @@ static bool load_run(const job *j, run *r)
 
 typedef struct making {
     job *j;
-    size_t *todo; /* runs */
+    size_t *waiting; /* runs */
 } making;
 
 static tl_status make_run(void *context, tl_parallel *loop, uint64_t item, unsigned worker, tl_error *error)
 {
     making *m = context;
     job *j = m->j;
-    run *r = &j->runs[m->todo[item]];
+    run *r = &j->runs[m->waiting[item]];
     (void)loop;
     (void)worker;
     float *z = tl_alloc_grid(j->cells + 1, j->cells + 1, sizeof *z);
@@ -371,25 +376,25 @@ static tl_status make_folders(const job *j, tl_error *error)
 static tl_status make_runs(job *j, tl_error *error)
 {
     const tl_grid_tiles_options *o = j->options;
-    making m = {j, tl_alloc(j->run_count, sizeof *m.todo)};
+    making m = {j, tl_alloc(j->run_count, sizeof *m.waiting)};
     size_t count = 0;
     tl_run workers = o->run ? *o->run : (tl_run){0};
-    for (size_t k = 0; m.todo && k < j->run_count; k++) {
+    for (size_t k = 0; m.waiting && k < j->run_count; k++) {
         run *r = &j->runs[k];
         r->done = (o->resume || o->shards || o->finish) && load_run(j, r);
         j->report->done_before += r->done;
         if (!r->done && (!o->shards || k % o->shards == o->shard))
-            m.todo[count++] = k;
+            m.waiting[count++] = k;
     }
-    if (m.todo && o->finish && !o->resume && count) {
-        free(m.todo);
+    if (m.waiting && o->finish && !o->resume && count) {
+        free(m.waiting);
         return tl_fail(
             error, TL_ERROR_ARGUMENT,
             "%s: %zu of its %zu runs of tiles are not done; run the shards first, or finish all with --resume",
             j->folder, count, j->run_count);
     }
     uint64_t side = (uint64_t)j->cells + 1, samples = count * RUN * side * side;
-    tl_status status = m.todo ? make_folders(j, error) : tl_fail_memory(error, j->folder);
+    tl_status status = m.waiting ? make_folders(j, error) : tl_fail_memory(error, j->folder);
     double tile = COPIES * (double)(side * side) * sizeof(float);
     unsigned most = tl_parallel_workers(o->run, count);
     if (workers.memory && tile * most > (double)workers.memory) /* as many as there is room for */
@@ -399,7 +404,7 @@ static tl_status make_runs(job *j, tl_error *error)
         status = tl_run_fits(o->run, tile, j->source->info.name, "cutting it into tiles", error);
     if (status == TL_OK)
         status = tl_parallel_for(&workers, count, samples, make_run, &m, error);
-    free(m.todo);
+    free(m.waiting);
     return status;
 }
 

@@ -155,6 +155,11 @@ tl_status out_begin_folder(const out_pyramid *p, const char *text, tl_error *err
         return status;
     /* in this order: another shard begins before it writes tiles */
     bool empty = is_empty(p->folder), begun = exists(p->folder, ".talus/job.json");
+    if (!begun && exists(p->folder, p->scheme->index))
+        return tl_fail(error, TL_ERROR_IO,
+                       go_on ? "%s: holds finished tiles, of another source or other options; name another folder"
+                             : "%s: holds finished tiles; name another folder",
+                       p->folder);
     if (!begun && !empty)
         return tl_fail(error, TL_ERROR_IO, "%s: is not empty, and holds no tiles that were begun; name another folder",
                        p->folder);
