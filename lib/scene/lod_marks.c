@@ -13,7 +13,7 @@ bool lod_list_grow(lod_list *list, size_t more, size_t size)
         return false;
     if (need <= list->room)
         return true;
-    size_t room = need > 2 * list->room ? need + 256 : 2 * list->room;
+    size_t half = list->room + list->room / 2, room = need > half ? need + 256 : half;
     void *bigger = tl_size_mul(room, size, &bytes) ? realloc(list->items, bytes) : NULL;
     if (!bigger)
         return false;

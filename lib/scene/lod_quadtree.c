@@ -7,14 +7,15 @@
 
 #include <math.h>
 
-enum { TESTED = 512 };
+enum { TESTED = 512, SLICE = 256 * TESTED /* triangles whose verdicts are kept at a time */ };
 
 /* What is hidden by a rule that is switched off is searched for in a second pass, with the rules that are left. It may
  * not split what is seen: so switching rules off changes nothing that is seen, to the last triangle. */
 typedef struct search {
     lod *l;
     lod_list current, next; /* lod_triangle */
-    lod_list verdicts;      /* lod_verdict, of the current ones */
+    lod_verdict *verdicts;  /* of a slice of the current ones */
+    size_t first, end;      /* of this slice */
     lod_list *leaves;
     lod_list hidden;  /* lod_leaf: by rules that are switched off; by depth */
     size_t taken;     /* of these, in the second pass */
@@ -29,12 +30,12 @@ static tl_status test_item(void *context, tl_parallel *loop, uint64_t item, unsi
     (void)loop;
     (void)worker;
     (void)error;
-    search *self = context;
-    size_t end = (size_t)(item + 1) * TESTED;
-    end = end < self->current.count ? end : self->current.count;
+    const search *self = context;
+    size_t first = self->first + (size_t)item * TESTED;
+    size_t end = first + TESTED < self->end ? first + TESTED : self->end;
     const lod_triangle *triangles = self->current.items;
-    for (size_t k = (size_t)item * TESTED; k < end; k++)
-        ((lod_verdict *)self->verdicts.items)[k] = lod_test(self->l, &triangles[k], self->depth, self->rules);
+    for (size_t k = first; k < end; k++)
+        self->verdicts[k - self->first] = lod_test(self->l, &triangles[k], self->depth, self->rules);
     return TL_OK;
 }
 
@@ -46,17 +47,38 @@ tl_status lod_want_block(lod *l, lod_triangle *t, tl_error *error)
     return scene_tiles_want_block(l->tiles, i, j, &t->block, error);
 }
 
-static tl_status test_all(search *self, tl_error *error)
+static tl_status test_slice(search *self, tl_error *error)
 {
-    lod *l = self->l;
-    self->verdicts.count = 0;
-    if (!lod_list_grow(&self->verdicts, self->current.count, sizeof(lod_verdict)))
-        return tl_fail_memory(error, "the view's triangles");
+    const lod *l = self->l;
+    size_t count = self->end - self->first;
     tl_run quiet = l->run ? *l->run : (tl_run){0};
     quiet.progress = NULL;
-    if (self->current.count <= 4 * TESTED)
+    if (count <= 4 * TESTED)
         quiet.threads = 1;
-    return tl_parallel_for(&quiet, (self->current.count + TESTED - 1) / TESTED, 0, test_item, self, error);
+    return tl_parallel_for(&quiet, (count + TESTED - 1) / TESTED, 0, test_item, self, error);
+}
+
+/* What becomes of a triangle with its verdict; it stays in `current` where `keep` is set. */
+typedef tl_status decide(search *self, lod_triangle *t, const lod_verdict *v, bool *keep, tl_error *error);
+
+/* Looks at all current triangles, and decides on each in turn. */
+static tl_status sift(search *self, decide *on, tl_error *error)
+{
+    lod_triangle *triangles = self->current.items;
+    size_t kept = 0, count = self->current.count;
+    tl_status status = TL_OK;
+    for (self->first = 0; self->first < count && status == TL_OK; self->first = self->end) {
+        self->end = self->first + SLICE < count ? self->first + SLICE : count;
+        status = test_slice(self, error);
+        for (size_t k = self->first; k < self->end && status == TL_OK; k++) {
+            bool keep = false;
+            status = on(self, &triangles[k], &self->verdicts[k - self->first], &keep, error);
+            if (keep)
+                triangles[kept++] = triangles[k];
+        }
+    }
+    self->current.count = kept;
+    return status;
 }
 
 static int rule_index(unsigned rule)
@@ -196,31 +218,22 @@ static tl_status leave_out(search *self, const lod_triangle *t, unsigned rule, t
     return TL_OK;
 }
 
-/* Sorts the tested triangles into leaves, and those whose middles are asked for, which stay in `current`. */
-static tl_status sort_out(search *self, tl_error *error)
+/* Sorts triangles into leaves, and those whose middles are to be asked for, which stay. */
+static tl_status sort_out(search *self, lod_triangle *t, const lod_verdict *v, bool *keep, tl_error *error)
 {
     lod *l = self->l;
-    lod_triangle *triangles = self->current.items;
-    size_t kept = 0;
-    tl_status status = TL_OK;
-    l->stats.visited += self->current.count;
-    l->asked.count = 0;
-    for (size_t k = 0; k < self->current.count && status == TL_OK; k++) {
-        const lod_verdict *v = (const lod_verdict *)self->verdicts.items + k;
-        bool split = v->state == LOD_SPLIT && may_split(self, &triangles[k]);
-        if (v->state == LOD_HIDDEN)
-            status = leave_out(self, &triangles[k], v->rule, error);
-        else if (split) {
-            triangles[kept] = triangles[k];
-            triangles[kept++].step = v->step;
-        } else if (v->state != LOD_DROPPED) {
-            l->stats.pixel_error = fmax(l->stats.pixel_error, self->seen ? 0 : (double)v->pixels);
-            lod_spare(l, v->priority);
-            status = leave(self, &triangles[k], v->state != LOD_SPLIT || v->pixels < HUGE_VALF, error);
-        }
+    if (v->state == LOD_HIDDEN)
+        return leave_out(self, t, v->rule, error);
+    if (v->state == LOD_DROPPED)
+        return TL_OK;
+    if (v->state == LOD_SPLIT && may_split(self, t)) {
+        t->step = v->step;
+        *keep = true;
+        return TL_OK;
     }
-    self->current.count = kept;
-    return status;
+    l->stats.pixel_error = fmax(l->stats.pixel_error, self->seen ? 0 : (double)v->pixels);
+    lod_spare(l, v->priority);
+    return leave(self, t, v->state != LOD_SPLIT || v->pixels < HUGE_VALF, error);
 }
 
 /* Asks for the middles, and queues the halves. */
@@ -256,22 +269,20 @@ static tl_status split_all(search *self, tl_error *error)
     return status;
 }
 
+/* Lets what is not hidden stay. */
+static tl_status leave_hidden(search *self, lod_triangle *t, const lod_verdict *v, bool *keep, tl_error *error)
+{
+    *keep = v->state != LOD_HIDDEN && v->state != LOD_DROPPED;
+    return v->state == LOD_HIDDEN ? leave_out(self, t, v->rule, error) : TL_OK;
+}
+
 /* Looks for the blocks of what is not hidden. */
 static tl_status enter_blocks(search *self, tl_error *error)
 {
     lod *l = self->l;
-    tl_status status = test_all(self, error);
+    tl_status status = sift(self, leave_hidden, error);
     lod_triangle *triangles = self->current.items;
-    size_t kept = 0;
-    for (size_t k = 0; k < self->current.count && status == TL_OK; k++) {
-        const lod_verdict *v = (const lod_verdict *)self->verdicts.items + k;
-        if (v->state == LOD_HIDDEN)
-            status = leave_out(self, &triangles[k], v->rule, error);
-        else if (v->state != LOD_DROPPED)
-            triangles[kept++] = triangles[k];
-    }
-    self->current.count = kept;
-    for (size_t k = 0; k < kept && status == TL_OK; k++)
+    for (size_t k = 0; k < self->current.count && status == TL_OK; k++)
         status = lod_want_block(l, &triangles[k], error);
     return status == TL_OK ? scene_tiles_make(l->tiles, l->run, error) : status;
 }
@@ -283,14 +294,14 @@ static tl_status one_depth(search *self, tl_error *error)
     if (status == TL_OK)
         status = lod_fits(l,
                           (self->current.room + self->next.room) * sizeof(lod_triangle) +
-                              self->leaves->room * sizeof(lod_leaf) + self->verdicts.room * sizeof(lod_verdict),
+                              self->leaves->room * sizeof(lod_leaf) + SLICE * sizeof *self->verdicts,
                           error);
     if (status == TL_OK && self->depth == lod_block_depth(l))
         status = enter_blocks(self, error);
+    l->stats.visited += self->current.count;
+    l->asked.count = 0;
     if (status == TL_OK)
-        status = test_all(self, error);
-    if (status == TL_OK)
-        status = sort_out(self, error);
+        status = sift(self, sort_out, error);
     if (status == TL_OK)
         status = split_all(self, error);
     return status;
@@ -339,8 +350,10 @@ static tl_status search_hidden(search *self, uint64_t limit, tl_error *error)
 tl_status lod_quadtree(lod *l, uint64_t limit, lod_list *leaves, tl_error *error)
 {
     search self = {.l = l, .leaves = leaves, .rules = l->rules};
-    tl_status status =
-        lod_list_grow(&self.current, 2, sizeof(lod_triangle)) ? TL_OK : tl_fail_memory(error, "the view");
+    self.verdicts = tl_alloc(SLICE, sizeof *self.verdicts);
+    tl_status status = self.verdicts && lod_list_grow(&self.current, 2, sizeof(lod_triangle))
+                           ? TL_OK
+                           : tl_fail_memory(error, "the view");
     if (status == TL_OK) {
         lod_roots(l, self.current.items);
         self.current.count = 2;
@@ -350,7 +363,7 @@ tl_status lod_quadtree(lod *l, uint64_t limit, lod_list *leaves, tl_error *error
         status = search_hidden(&self, limit, error);
     free(self.current.items);
     free(self.next.items);
-    free(self.verdicts.items);
+    free(self.verdicts);
     free(self.hidden.items);
     free(self.seen);
     return status;
