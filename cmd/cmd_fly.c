@@ -148,10 +148,12 @@ static tl_status draw_frame(const journey *j, const tl_mesh *mesh, size_t frame,
 static tl_status write_frame(const journey *j, const tl_mesh *mesh, size_t frame, tl_error *error)
 {
     char name[NAME];
-    const tl_write_options writing = {.overwrite = j->set->common.overwrite,
-                                      .frame = (tl_frame)j->set->frame,
-                                      .ground = j->ground->field,
-                                      .run = j->run};
+    tl_write_options writing = {.overwrite = j->set->common.overwrite,
+                                .frame = (tl_frame)j->set->frame,
+                                .ground = j->ground->field,
+                                .texture_size = (int)j->set->common.texture_size,
+                                .run = j->run};
+    command_textures(&j->set->common, &writing.textures);
     if (frame_name(j->set->common.output, frame, name))
         return draws_pictures(j->set) ? draw_frame(j, mesh, frame, name, error)
                                       : tl_write_mesh(mesh, name, &writing, error);
@@ -332,7 +334,9 @@ static bool settings_ok(settings *set)
         complain("-o: a name with the frame's number in it is wanted, as frame%%04d.glb, not '%s'", set->common.output);
         return false;
     }
-    return !set->common.output || draws_pictures(set) || command_output_ok(&set->common, false, true);
+    unsigned textures;
+    return (!set->common.output || draws_pictures(set) || command_output_ok(&set->common, false, true)) &&
+           command_textures(&set->common, &textures);
 }
 
 static int run(const command *self, int argc, const char **argv, bool help)
@@ -358,6 +362,7 @@ static int run(const command *self, int argc, const char **argv, bool help)
     const option input[] = {COMMON_INPUT(set.common), {0}};
     const option output[] = {
         COMMON_OUTPUT(set.common),
+        TEXTURE_OPTIONS(set.common),
         {"frame", 0, OPTION_CHOICE, &set.frame, NULL, "FRAME",
          "coordinates of the meshes (default: enu where the CRS is known)", 0, 0, frame_names},
         {"json", 0, OPTION_FLAG, &set.json, NULL, NULL, "print each frame's statistics as JSON", 0, 0, NULL},

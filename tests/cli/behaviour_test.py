@@ -1030,6 +1030,13 @@ def flights_tell_how_far_ground_jumps(case):
         expect(rows[0].endswith(",seconds,shift") and len(rows) == 6, f"{rows}")
         largest.append(max(float(row.split(",")[-1]) for row in rows[1:]))
     expect(0 < largest[1] < largest[0] / 2 and largest[1] < 1, f"{largest}")
+    case.run("fly", EXAMPLE, "--path", "path.json", "--frames", 2, "-l", 2, "--texture", "colour", "--texture-size", 256, "-o", "f%d.glb")
+    case.run("view", EXAMPLE, "--eye", "-84.25,36.55,900", "--viewport", "240x160", "--heading", 120, "--pitch", -5, "-l", 2, "--texture", "colour",
+             "--texture-size", 256, "-o", "same.glb")
+    with open(case.path("f0.glb"), "rb") as frame, open(case.path("same.glb"), "rb") as view:
+        first, other = frame.read(), view.read()
+    expect(first.count(b"image/png") == other.count(b"image/png") > 0, f"{first.count(b'image/png')}, {other.count(b'image/png')} textures")
+    case.run("fly", EXAMPLE, "--path", "path.json", "--texture", "colour", "-o", "g%d.ply", status=2)
     with open(case.path("deep.json"), "w", encoding="utf-8") as file:
         json.dump({"views": [{"eye": [-84.25, 36.55, -900]}, {"eye": [-84.2499, 36.5499, -900]}]}, file)
     said = case.run("fly", EXAMPLE, "--path", "deep.json", "--frames", 3).err
