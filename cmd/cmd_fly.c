@@ -339,7 +339,7 @@ static bool settings_ok(settings *set)
            command_textures(&set->common, &textures);
 }
 
-static int run(const command *self, int argc, const char **argv, bool help)
+static int run(const command *self, int argc, const char **argv, command_help help)
 {
     settings set = {.lod = {.levels = 6, .selector = TL_SELECTOR_ROAM}, .rate = 25};
     const option flying[] = {

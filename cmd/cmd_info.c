@@ -398,7 +398,7 @@ static int inform(const settings *set, const arguments *inputs)
     return status;
 }
 
-static int run(const command *self, int argc, const char **argv, bool help)
+static int run(const command *self, int argc, const char **argv, command_help help)
 {
     settings set = {.common = {.any_contents = true}};
     const option output[] = {

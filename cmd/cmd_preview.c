@@ -76,7 +76,7 @@ static int draw(settings *set, const arguments *inputs)
     return status;
 }
 
-static int run(const command *self, int argc, const char **argv, bool help)
+static int run(const command *self, int argc, const char **argv, command_help help)
 {
     settings set = {.common = {.any_contents = true}, .preview = {.exaggeration = 1, .fov = 50}};
     const option picture[] = {

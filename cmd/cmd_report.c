@@ -143,7 +143,7 @@ static int make_report(const settings *set, const arguments *inputs, int argc, c
     return EXIT_DONE;
 }
 
-static int run_report(const command *self, int argc, const char **argv, bool help)
+static int run_report(const command *self, int argc, const char **argv, command_help help)
 {
     settings set = {0};
     const option made[] = {

@@ -204,7 +204,7 @@ static int serve(server *self, uint16_t port, const common *shared)
     return EXIT_DONE;
 }
 
-static int run_serve(const command *self, int argc, const char **argv, bool help)
+static int run_serve(const command *self, int argc, const char **argv, command_help help)
 {
     common shared = {.progress = PROGRESS_NONE};
     int64_t port = PORT;
@@ -232,7 +232,7 @@ static int run_serve(const command *self, int argc, const char **argv, bool help
 }
 
 #else
-static int run_serve(const command *self, int argc, const char **argv, bool help)
+static int run_serve(const command *self, int argc, const char **argv, command_help help)
 {
     const option_group groups[] = {{0}};
     arguments rest;

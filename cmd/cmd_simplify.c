@@ -457,7 +457,7 @@ static bool settings_ok(settings *set)
     return false;
 }
 
-static int run(const command *self, int argc, const char **argv, bool help)
+static int run(const command *self, int argc, const char **argv, command_help help)
 {
     settings set = {0};
     const option shape[] = {

@@ -276,7 +276,7 @@ static bool sensible(const settings *set)
     return true;
 }
 
-static int run(const command *self, int argc, const char **argv, bool help)
+static int run(const command *self, int argc, const char **argv, command_help help)
 {
     settings set = {0};
     const option output[] = {

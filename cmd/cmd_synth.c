@@ -713,7 +713,7 @@ static bool take_record(const command *self, int argc, const char **argv, const 
     return good;
 }
 
-static int run_synth(const command *self, int argc, const char **argv, bool help)
+static int run_synth(const command *self, int argc, const char **argv, command_help help)
 {
     settings set = {.levels = 4};
     const option detail[] = {
@@ -754,7 +754,7 @@ static int run_synth(const command *self, int argc, const char **argv, bool help
     arguments rest;
     int status;
     if (!command_begin(self, argc, argv, help, groups, ANY_INPUTS, &rest, &status)) {
-        if (help || status == EXIT_DONE)
+        if (help == HELP_TEXT || (!help && status == EXIT_DONE))
             list_schemes(false);
         return status;
     }
@@ -791,7 +791,7 @@ static int noise(settings *set)
     return status;
 }
 
-static int run_noise(const command *self, int argc, const char **argv, bool help)
+static int run_noise(const command *self, int argc, const char **argv, command_help help)
 {
     settings set = {.noise = {.size = 1024, .hurst = 0.8, .delta = 1}};
     const option surface[] = {
@@ -814,7 +814,7 @@ static int run_noise(const command *self, int argc, const char **argv, bool help
     arguments rest;
     int status;
     if (!command_begin(self, argc, argv, help, groups, 0, &rest, &status)) {
-        if (help || status == EXIT_DONE)
+        if (help == HELP_TEXT || (!help && status == EXIT_DONE))
             list_schemes(true);
         return status;
     }

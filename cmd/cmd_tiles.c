@@ -211,7 +211,7 @@ static bool format_ok(const settings *set)
     return false;
 }
 
-static int run_tiles(const command *self, int argc, const char **argv, bool help)
+static int run_tiles(const command *self, int argc, const char **argv, command_help help)
 {
     settings set = {0};
     const option tiles[] = {

@@ -166,7 +166,7 @@ static bool morph_ok(const settings *set)
     return false;
 }
 
-static int run(const command *self, int argc, const char **argv, bool help)
+static int run(const command *self, int argc, const char **argv, command_help help)
 {
     settings set = {.lod = {.levels = 6}};
     const option place[] = {VIEW_OPTIONS(set.view), {0}};

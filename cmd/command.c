@@ -1,5 +1,7 @@
 #include "cmd/command.h"
 
+#include "cmd/completions.h"
+
 #include <errno.h>
 #include <math.h>
 #include <stdarg.h>
@@ -37,15 +39,18 @@ bool command_misses_input(const command *self)
     return false;
 }
 
-bool command_begin(const command *self, int argc, const char **argv, bool help, const option_group *groups, int inputs,
-                   arguments *rest, int *status)
+bool command_begin(const command *self, int argc, const char **argv, command_help help, const option_group *groups,
+                   int inputs, arguments *rest, int *status)
 {
     *rest = (arguments){0};
     parse_result result = help ? PARSE_HELP : options_parse(self->name, argc, argv, groups, rest);
     if (result == PARSE_HELP) {
-        print_help(self, groups);
+        if (help > HELP_TEXT)
+            completions_of_command(help, self, groups);
+        else
+            print_help(self, groups);
         arguments_free(rest);
-        *status = command_done();
+        *status = help > HELP_TEXT ? EXIT_DONE : command_done();
         return false;
     }
     size_t least = inputs == ANY_INPUTS ? 0

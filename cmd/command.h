@@ -6,13 +6,16 @@
 #include "cmd/progress.h"
 #include "lib/talus.h"
 
+/* In place of work: all options for people, or for the completion of a shell. */
+typedef enum command_help { HELP_NONE, HELP_TEXT, HELP_FOR_BASH, HELP_FOR_ZSH, HELP_FOR_FISH } command_help;
+
 typedef struct command {
     const char *name;
     const char *summary;   /* one line */
     const char *arguments; /* what follows the name, as "DEM -o OUTPUT" */
     const char *notes;     /* a paragraph or example for the help; may be "" */
-    /* argv[0] is the command's name; returns an exit status. With help set, only prints its options. */
-    int (*run)(const struct command *self, int argc, const char **argv, bool help);
+    /* argv[0] is the command's name; returns an exit status. With help, only prints its options. */
+    int (*run)(const struct command *self, int argc, const char **argv, command_help help);
 } command;
 
 extern const command command_info, command_simplify, command_synth, command_preview, command_noise, command_stats,
@@ -200,8 +203,8 @@ enum { ANY_INPUTS = -2 };
 
 /* Parses the command's options and checks that `inputs` file names stand beside them (-1: one or more). False: the
  * caller ends with *status. */
-bool command_begin(const command *self, int argc, const char **argv, bool help, const option_group *groups, int inputs,
-                   arguments *rest, int *status);
+bool command_begin(const command *self, int argc, const char **argv, command_help help, const option_group *groups,
+                   int inputs, arguments *rest, int *status);
 
 /* "An input file is missing" and the usage; false. */
 bool command_misses_input(const command *self);

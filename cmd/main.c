@@ -1,4 +1,4 @@
-#include "cmd/command.h"
+#include "cmd/completions.h"
 
 #include <fcntl.h>
 #include <locale.h>
@@ -25,11 +25,12 @@ static int unknown(const char *name)
         complain("'%s' stands before the command; options go behind it: talus COMMAND ... %s", name, name);
         return EXIT_USAGE;
     }
-    const char *names[COMMAND_COUNT + 1];
+    const char *names[COMMAND_COUNT + 2];
     for (size_t i = 0; i < COMMAND_COUNT; i++)
         names[i] = commands[i]->name;
     names[COMMAND_COUNT] = "help";
-    const char *near = nearest_name(name, names, COMMAND_COUNT + 1, sizeof *names);
+    names[COMMAND_COUNT + 1] = "completions";
+    const char *near = nearest_name(name, names, COMMAND_COUNT + 2, sizeof *names);
     if (near)
         complain("unknown command '%s'; did you mean '%s'?", name, near);
     else
@@ -44,9 +45,12 @@ static void print_overview(FILE *to)
             "Usage: talus COMMAND INPUT -o OUTPUT [OPTION...]\n\nCommands:\n",
             tl_version());
     for (size_t i = 0; i < COMMAND_COUNT; i++)
-        fprintf(to, "  %-10s %s\n", commands[i]->name, commands[i]->summary);
-    fprintf(to, "  %-10s %s\n  %-10s %s\n", "help", "tell more of a command: talus help COMMAND", "version",
-            "print the version");
+        fprintf(to, "  %-11s %s\n", commands[i]->name, commands[i]->summary);
+    static const char *const others[][2] = {{"help", "tell more of a command: talus help COMMAND"},
+                                            {"completions", "print completions for a shell: bash, zsh or fish"},
+                                            {"version", "print the version"}};
+    for (size_t i = 0; i < sizeof others / sizeof *others; i++)
+        fprintf(to, "  %-11s %s\n", others[i][0], others[i][1]);
     fprintf(to, "\nTry: talus synth dem.tif --levels 4 -o terrain.exr\n");
 }
 
@@ -60,12 +64,13 @@ static int help(int argc, const char **argv)
 {
     if (argc > 2)
         return too_many(argv[2]);
-    if (argc < 2 || strcmp(argv[1], "help") == 0 || strcmp(argv[1], "version") == 0) {
+    if (argc < 2 || strcmp(argv[1], "help") == 0 || strcmp(argv[1], "version") == 0 ||
+        strcmp(argv[1], "completions") == 0) {
         print_overview(stdout);
         return command_done();
     }
     const command *named = find(argv[1]);
-    return named ? named->run(named, 1, argv + 1, true) : unknown(argv[1]);
+    return named ? named->run(named, 1, argv + 1, HELP_TEXT) : unknown(argv[1]);
 }
 
 static int version(int argc, const char **argv)
@@ -103,6 +108,8 @@ int main(int argc, char **words)
         return version(argc - 1, argv + 1);
     if (strcmp(name, "help") == 0 || strcmp(name, "--help") == 0 || strcmp(name, "-h") == 0)
         return help(argc - 1, argv + 1);
+    if (strcmp(name, "completions") == 0)
+        return completions_print(argc - 1, argv + 1, commands, COMMAND_COUNT);
     const command *chosen = find(name);
-    return chosen ? chosen->run(chosen, argc - 1, argv + 1, false) : unknown(name);
+    return chosen ? chosen->run(chosen, argc - 1, argv + 1, HELP_NONE) : unknown(name);
 }

@@ -1167,13 +1167,58 @@ def manuals_show_what_works(case):
             case.run(*words, *(["--overwrite"] if "--picture" in words else []))
 
 
-def man_page_knows_every_option(case):
+def commands(case):
+    """The commands' names, and the long options of each."""
+    names = [name for name in re.findall(r"^  (\w+) ", case.run("help").out, flags=re.M) if name not in ("help", "version", "completions")]
+    return {name: re.findall(r"^ +(?:-\w, )?--([\w-]+)", case.run("help", name).out, flags=re.M) for name in names}
+
+
+def manuals_and_help_agree(case):
+    """Every option is in the man page, and every option that the man page or the README names is some command's."""
+    known = commands(case)
+    expect(len(known) == 11 and all(known.values()), f"{known}")
     with open(os.path.join(ROOT, "doc", "talus.1.scd"), encoding="utf-8") as file:
         page = file.read()
-    for name in ("info", "simplify", "synth", "stats", "preview", "noise", "view", "fly"):
+    for name, options in known.items():
         expect(f"*talus {name}*" in page and f"## {name}" in page, f"{name} is not in the man page")
-        for option in re.findall(r"^ +(?:-\w, )?--([\w-]+)", case.run("help", name).out, flags=re.M):
+        for option in options:
             expect(f"--{option}*" in page, f"--{option} of {name} is not in the man page")
+    every = {option for options in known.values() for option in options} | {"help", "version"}
+    for option in re.findall(r"\*--([a-z][\w-]*)\*", page):
+        expect(option in every, f"--{option} of the man page is no command's")
+    for line in commands_in_readme():
+        name = line.split()[1]
+        for option in re.findall(r" --([a-z][\w-]*)", line):
+            expect(option in known.get(name, []), f"--{option} is no option of talus {name}: {line}")
+
+
+def completions_are_those_of_the_help(case):
+    """bash completes commands, options and values; zsh and fish, where they are, read what is made for them."""
+    known = commands(case)
+    for shell in ("bash", "zsh", "fish"):
+        with open(case.path(shell), "w", encoding="utf-8") as file:
+            file.write(case.run("completions", shell).out)
+        if shutil.which(shell):
+            subprocess.run([shell, "-n", case.path(shell)], check=True)
+    with open(case.path("fish"), encoding="utf-8") as file:
+        fish = file.read()
+    for name, options in known.items():
+        for option in options:
+            expect(f"from {name}' -l {option} " in fish, f"--{option} of {name}")
+
+    def complete(*words):
+        script = f'. {case.path("bash")}; compopt() {{ :; }}; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); _talus; echo "${{COMPREPLY[@]}}"'
+        return subprocess.run(["bash", "-c", script, "bash", *words], check=True, capture_output=True, text=True).stdout.split()
+
+    expect(complete("talus", "sy") == ["synth"], f"{complete('talus', 'sy')}")
+    expect(set(complete("talus", "")) == set(known) | {"help", "version", "completions"}, f"{complete('talus', '')}")
+    for name, options in known.items():
+        expect(set(complete("talus", name, "--")) == {f"--{option}" for option in options} | {"--help"}, name)
+    expect(complete("talus", "tiles", "--format", "quant") == ["quantized-mesh"], "--format")
+    expect(complete("talus", "tiles", "--format", "=", "3d") == ["3dtiles"], "--format=")
+    expect(complete("talus", "synth", "--levels", "") == [], "a number")
+    case.run("completions", status=2)
+    case.run("completions", "tcsh", status=2)
 
 
 # ---- tiles ----
@@ -1416,7 +1461,7 @@ TESTS = [
     glb_is_in_metres, frames_agree, simplify_keeps_its_word, diagonals_are_turned, codings_keep_the_bound, layers_are_written_beside, inputs_are_not_overwritten, layers_are_refused_before_the_work, vertices_tell_where_they_came_from,
     flights_tell_how_far_ground_jumps, pictures_take_colours_of_rasters,
     tiles_survive_kills, tiles_go_on_after_an_interruption, tiles_tell_a_full_disk, tiles_by_parts_are_the_same,
-    manuals_show_what_works, man_page_knows_every_option,
+    manuals_show_what_works, manuals_and_help_agree, completions_are_those_of_the_help,
     memory_does_not_grow_with_the_output, memory_stays_within_what_is_given, bad_files_end_with_one_line,
     gdal_reads_the_geotiff, gdal_places_the_example, openexr_reads_the_exr, openimageio_agrees_on_the_range,
 ]
