@@ -77,7 +77,7 @@ static int version(int argc, const char **argv)
 {
     if (argc > 1)
         return too_many(argv[1]);
-    printf("talus %s\n", tl_version());
+    printf("talus %s%s%s%s\n", tl_version(), *tl_lacks() ? " (without " : "", tl_lacks(), *tl_lacks() ? ")" : "");
     return command_done();
 }
 

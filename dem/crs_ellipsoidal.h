@@ -4,14 +4,15 @@
 
 #include "lib/base/georef.h"
 
-#include <proj.h>
+struct PJconsts; /* PJ and PJ_CONTEXT of <proj.h> */
+struct pj_ctx;
 
 /* What tl_crs_vertical_name calls them. */
 extern const char dem_ellipsoidal_name[];
 
 /* Takes a two-dimensional CRS and gives it with a third axis, of heights above its ellipsoid, whose unit has `metres`
  * metres; the CRS itself where PROJ cannot. */
-PJ *dem_crs_promote(PJ_CONTEXT *context, PJ *crs, double metres);
+struct PJconsts *dem_crs_promote(struct pj_ctx *context, struct PJconsts *crs, double metres);
 
 /* What the keys of a GeoTIFF say of heights: the code of their CRS, user-defined (32767) where they have a name and no
  * code; 0 where the CRS says nothing of them. */

@@ -4,8 +4,6 @@
 #include "lib/base/number.h"
 #include "lib/base/size.h"
 
-#include <geotiff/geokeys.h>
-#include <geotiff/geovalues.h>
 #include <math.h>
 #include <string.h>
 
@@ -155,15 +153,20 @@ char *dem_geokeys_text(const dem_geokeys *keys, uint16_t key)
 tl_raster_type dem_geokeys_raster_type(const dem_geokeys *keys)
 {
     uint16_t value;
-    bool point = dem_geokeys_short(keys, GTRasterTypeGeoKey, &value) && value == RasterPixelIsPoint;
+    bool point = dem_geokeys_short(keys, TL_KEY_RASTER_TYPE, &value) && value == TL_RASTER_IS_POINT;
     return point ? TL_RASTER_POINT : TL_RASTER_AREA;
+}
+
+double dem_unit_of_length(uint16_t code)
+{
+    return code == TL_UNIT_FOOT ? 0.3048 : code == TL_UNIT_US_SURVEY_FOOT ? 1200.0 / 3937.0 : 1.0;
 }
 
 double dem_geokeys_height_unit(const dem_geokeys *keys)
 {
     uint16_t value = 0;
-    dem_geokeys_short(keys, VerticalUnitsGeoKey, &value);
-    return value == Linear_Foot ? 0.3048 : value == Linear_Foot_US_Survey ? 1200.0 / 3937.0 : 1.0;
+    dem_geokeys_short(keys, TL_KEY_VERTICAL_UNIT, &value);
+    return dem_unit_of_length(value);
 }
 
 /* ---- Position ---- */

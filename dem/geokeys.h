@@ -4,6 +4,31 @@
 
 #include "dem/tiff_file.h"
 
+/* Numbers of keys and values, of the GeoTIFF standard (OGC 19-008r4), that are read without libgeotiff too. */
+enum {
+    TL_KEY_MODEL_TYPE = 1024,
+    TL_KEY_RASTER_TYPE = 1025,
+    TL_KEY_CITATION = 1026,
+    TL_KEY_GEODETIC_CRS = 2048,
+    TL_KEY_GEODETIC_CITATION = 2049,
+    TL_KEY_ANGULAR_UNIT = 2054,
+    TL_KEY_SEMI_MAJOR_AXIS = 2057,
+    TL_KEY_SEMI_MINOR_AXIS = 2058,
+    TL_KEY_INVERSE_FLATTENING = 2059,
+    TL_KEY_PROJECTED_CRS = 3072,
+    TL_KEY_PROJECTED_CITATION = 3073,
+    TL_KEY_LINEAR_UNIT = 3076,
+    TL_KEY_LINEAR_UNIT_SIZE = 3077,
+    TL_KEY_VERTICAL_UNIT = 4099,
+    TL_MODEL_PROJECTED = 1,
+    TL_MODEL_GEOGRAPHIC = 2,
+    TL_RASTER_IS_AREA = 1,
+    TL_RASTER_IS_POINT = 2,
+    TL_UNIT_DEGREE = 9102,
+    TL_UNIT_FOOT = 9002,
+    TL_UNIT_US_SURVEY_FOOT = 9003,
+};
+
 /* Every entry of the directory is sound: what it points to is there. */
 typedef struct dem_geokeys {
     uint16_t *directory; /* header and entries, 4 numbers each; NULL: the file has no keys */
@@ -28,6 +53,8 @@ char *dem_geokeys_text(const dem_geokeys *keys, uint16_t key);
 
 /* AREA where the keys do not say POINT. */
 tl_raster_type dem_geokeys_raster_type(const dem_geokeys *keys);
+/* Metres in a unit of length, by its code: feet, else a metre. */
+double dem_unit_of_length(uint16_t code);
 /* Metres in one unit of height. */
 double dem_geokeys_height_unit(const dem_geokeys *keys);
 

@@ -36,6 +36,9 @@ extern "C" {
 
 /* The version of the library, as "0.1.0". */
 TL_API const char *tl_version(void);
+/* What this build was made without, by the names of the build's options, as "meshopt, png"; "" where it has all.
+ * Functions that need such a part fail with TL_ERROR_ARGUMENT, and say so. */
+TL_API const char *tl_lacks(void);
 
 /* ---- Errors ------------------------------------------------------------------------------------ */
 

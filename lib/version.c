@@ -4,3 +4,8 @@ const char *tl_version(void)
 {
     return TL_VERSION;
 }
+
+const char *tl_lacks(void)
+{
+    return TL_LACKS;
+}

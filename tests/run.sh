@@ -40,8 +40,12 @@ CC=clang CXX=clang++ setup "$builds/clang" --werror -Dtests=false
 clang=ok
 ninja -C "$builds/clang" --quiet || clang=failed
 
+echo "== without what talus can do without"
+lesser=ok
+python3 "$here/tests/lesser.py" "$builds/lesser" || lesser=failed
+
 echo "== fuzzing, 30 s a target"
 fuzzing=ok
 "$here/tests/fuzz/run.sh" 30 "$builds/fuzz" || fuzzing=failed
 
-python3 "$here/tests/summary.py" "clang warnings=$clang" "fuzzing=$fuzzing" "$builds"/release "$builds"/sanitize "$builds"/portable
+python3 "$here/tests/summary.py" "clang warnings=$clang" "build without optional parts=$lesser" "fuzzing=$fuzzing" "$builds"/release "$builds"/sanitize "$builds"/portable

@@ -12,8 +12,8 @@
 #include "lib/out/texture_tiles.h"
 #include "lib/scene/field.h"
 
+#include "lib/out/triangles.h"
 #include <jansson.h>
-#include <meshoptimizer.h>
 
 #include <math.h>
 #include <stdio.h>
@@ -1050,6 +1050,8 @@ static tl_status begin(const tl_mesh *mesh, const char *path, const tl_write_opt
 {
     if (!mesh->triangle_count)
         return tl_fail(error, TL_ERROR_DATA, "%s: there is no triangle to write, and glTF has no empty meshes", path);
+    if (options->coding == TL_CODING_COMPRESSED && !OUT_HAS_CODECS)
+        return out_lacks_codecs(path, error);
     if (options->parent_heights && options->coding != TL_CODING_PLAIN)
         return tl_fail(error, TL_ERROR_ARGUMENT, "%s: heights of parents are kept as floats; leave the coding away",
                        path);

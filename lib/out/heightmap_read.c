@@ -5,13 +5,11 @@
 #include "lib/base/size.h"
 #include "lib/out/heightmap.h"
 #include "lib/out/place.h"
-
-#include <png.h>
+#include "lib/out/png_decoder.h"
 
 #include <errno.h>
 #include <fcntl.h>
 #include <math.h>
-#include <setjmp.h>
 #include <string.h>
 #include <strings.h>
 #include <sys/stat.h>
@@ -207,73 +205,16 @@ static tl_status read_json(heightmap *self, tl_error *error)
 
 /* ---- PNG ---- */
 
-typedef struct png_input {
-    heightmap *self;
-    uint64_t at;
-    tl_error failure;
-} png_input;
-
-static void on_error(png_structp png, png_const_charp text)
+static tl_status read_png_bytes(void *context, void *to, size_t count, uint64_t at, tl_error *error)
 {
-    png_input *in = png_get_error_ptr(png);
-    if (in->failure.status == TL_OK)
-        tl_fail(&in->failure, TL_ERROR_DATA, "%s: the PNG cannot be read: %s", in->self->path, text);
-    png_longjmp(png, 1);
-}
-
-static void on_warning(png_structp png, png_const_charp text)
-{
-    (void)png;
-    (void)text;
-}
-
-static void on_read(png_structp png, png_bytep to, size_t count)
-{
-    png_input *in = png_get_io_ptr(png);
-    if (read_bytes(in->self, to, count, in->at, &in->failure) != TL_OK)
-        png_error(png, "cannot read");
-    in->at += count;
-}
-
-static void decode_png(png_structp png, png_infop info, png_input *in)
-{
-    heightmap *self = in->self;
-    const tl_source_info *grid = &self->source.info;
-    if (setjmp(png_jmpbuf(png)))
-        return;
-    png_set_user_limits(png, PNG_UINT_31_MAX, PNG_UINT_31_MAX);
-    png_set_read_fn(png, in, on_read);
-    png_read_info(png, info);
-    if (png_get_bit_depth(png, info) != 16 || png_get_color_type(png, info) != PNG_COLOR_TYPE_GRAY ||
-        png_get_interlace_type(png, info) != PNG_INTERLACE_NONE)
-        png_error(png, "not one of 16-bit grey");
-    if (png_get_image_width(png, info) != (png_uint_32)grid->width ||
-        png_get_image_height(png, info) != (png_uint_32)grid->height)
-        png_error(png, "its size is not that in the JSON file");
-    self->samples = tl_alloc_grid(grid->width, grid->height, 2);
-    if (!self->samples) {
-        tl_fail_memory(&in->failure, self->path);
-        return;
-    }
-    png_set_swap(png);
-    for (int64_t y = 0; y < grid->height; y++)
-        png_read_row(png, self->samples + (size_t)(y * grid->width) * 2, NULL);
+    return read_bytes(context, to, count, at, error);
 }
 
 static tl_status read_png(heightmap *self, tl_error *error)
 {
-    png_input in = {.self = self};
-    png_structp png = png_create_read_struct(PNG_LIBPNG_VER_STRING, &in, on_error, on_warning);
-    png_infop info = png ? png_create_info_struct(png) : NULL;
-    if (info)
-        decode_png(png, info, &in);
-    else
-        tl_fail_memory(&in.failure, self->path);
-    if (png)
-        png_destroy_read_struct(&png, &info, NULL);
-    if (in.failure.status != TL_OK && error)
-        *error = in.failure;
-    return in.failure.status;
+    const tl_source_info *grid = &self->source.info;
+    const out_png_input input = {read_png_bytes, self, self->path};
+    return out_png_read_grey16(&input, grid->width, grid->height, &self->samples, error);
 }
 
 /* ---- Opening ---- */

@@ -6,8 +6,8 @@
 #include "lib/base/size.h"
 #include "lib/out/summary_read.h"
 
+#include "lib/out/triangles.h"
 #include <jansson.h>
-#include <meshoptimizer.h>
 
 #include <errno.h>
 #include <math.h>

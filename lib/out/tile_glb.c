@@ -7,7 +7,7 @@
 #include "lib/base/size.h"
 #include "lib/out/tile_surface.h"
 
-#include <meshoptimizer.h>
+#include "lib/out/triangles.h"
 
 #include <math.h>
 #include <stdlib.h>

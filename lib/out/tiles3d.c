@@ -6,7 +6,7 @@
 #include "lib/out/tile_pictures.h"
 #include "lib/out/tile_schemes.h"
 
-#include <meshoptimizer.h>
+#include "lib/out/triangles.h"
 
 #include <math.h>
 #include <stdio.h>
@@ -144,6 +144,8 @@ tl_status out_write_3d_tiles(const tl_source *source, const char *folder, const 
                              tl_tiles_report *out, tl_error *error)
 {
     out_pyramid p = {.scheme = &own, .source = source, .folder = folder, .options = options};
+    if (options->coding == TL_CODING_COMPRESSED && !OUT_HAS_CODECS)
+        return out_lacks_codecs(folder, error);
     scene_own_lattice *lattice = scene_own_lattice_create(source, error);
     if (!lattice)
         return TL_ERROR_ARGUMENT;
