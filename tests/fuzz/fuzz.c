@@ -1,10 +1,13 @@
 #define _GNU_SOURCE /* memfd_create */
 #include "fuzz.h"
 
+#include <fcntl.h>
+#include <ftw.h>
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <sys/mman.h>
+#include <sys/stat.h>
 #include <unistd.h>
 
 enum {
@@ -31,6 +34,61 @@ const char *fuzz_file(const uint8_t *data, size_t size)
     return path;
 }
 
+static char folder[64];
+
+static int remove_one(const char *path, const struct stat *status, int kind, struct FTW *where)
+{
+    (void)status;
+    (void)kind;
+    (void)where;
+    return remove(path);
+}
+
+static void remove_folder(void)
+{
+    nftw(folder, remove_one, 8, FTW_DEPTH | FTW_PHYS);
+}
+
+const char *fuzz_folder(void)
+{
+    if (!*folder) {
+        snprintf(folder, sizeof folder, "%s/talus-fuzz-XXXXXX", access("/dev/shm", W_OK) == 0 ? "/dev/shm" : "/tmp");
+        fuzz_expect(mkdtemp(folder) != NULL);
+        atexit(remove_folder);
+    }
+    return folder;
+}
+
+const char *fuzz_named(const char *name, const uint8_t *data, size_t size)
+{
+    static char path[128];
+    snprintf(path, sizeof path, "%s/%s", fuzz_folder(), name);
+    int descriptor = open(path, O_WRONLY | O_CREAT | O_TRUNC | O_CLOEXEC, 0600);
+    bool good = descriptor >= 0 && write(descriptor, data, size) == (ssize_t)size;
+    if (descriptor >= 0)
+        close(descriptor);
+    fuzz_expect(good);
+    return path;
+}
+
+const tl_source *fuzz_model(void)
+{
+    enum { ROW = 5 };
+    static float heights[ROW * ROW];
+    static tl_source *source;
+    static const tl_source_info info = {
+        .width = ROW,
+        .height = ROW,
+        .type = TL_RASTER_POINT,
+        .georef = {.transform = {0, 1, 0, 0, 0, -1}, .cell_x = 1, .cell_y = 1, .height_unit = 1},
+        .name = "model"};
+    for (int k = 0; k < ROW * ROW && !source; k++)
+        heights[k] = (float)(k * k % 37);
+    source = source ? source : tl_array_source_create(heights, &info, NULL);
+    fuzz_expect(source != NULL);
+    return source;
+}
+
 static int64_t smaller(int64_t a, int64_t b)
 {
     return a < b ? a : b;
@@ -49,11 +107,16 @@ static void check_samples(const tl_source *source, int level, tl_window window, 
     }
 }
 
-static void check_error(const tl_error *error)
+void fuzz_text(const char *text)
+{
+    for (const char *c = text; *c; c++)
+        fuzz_expect((unsigned char)*c >= ' ' && *c != 0x7f);
+}
+
+void fuzz_error(const tl_error *error)
 {
     fuzz_expect(error->status != TL_OK && error->text[0]);
-    for (const char *c = error->text; *c; c++)
-        fuzz_expect((unsigned char)*c >= ' ' && *c != 0x7f);
+    fuzz_text(error->text);
 }
 
 static void read_window(const tl_source *source, int level, tl_window window)
@@ -63,7 +126,7 @@ static void read_window(const tl_source *source, int level, tl_window window)
     if (tl_source_read(source, level, window, heights, &error) == TL_OK)
         check_samples(source, level, window, heights);
     else
-        check_error(&error);
+        fuzz_error(&error);
 }
 
 static void read_coarser(const tl_source *source, int level)

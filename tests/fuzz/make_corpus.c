@@ -1,9 +1,15 @@
-/* The seeds of the fuzz targets: make_corpus FOLDER writes small TIFFs into FOLDER/raster and EXRs into FOLDER/exr. */
+/* The seeds of the fuzz targets: make_corpus FOLDER GOLDEN writes a folder for each target into FOLDER. Command lines
+ * are those of the golden tests, GOLDEN/NAME.args. */
+#include "fuzz.h"
+#include "lib/out/tile_pieces.h"
 #include "lib/talus.h"
 #include "tests/make_tiff.h"
 
+#include <dirent.h>
+#include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
+#include <string.h>
 #include <sys/stat.h>
 #include <tiffio.h>
 
@@ -207,17 +213,324 @@ static void add_large_exr(corpus *c)
     }
 }
 
+/* ---- What the other targets read: a byte that chooses the reader, and a file ---- */
+
+typedef struct seeds {
+    const corpus *corpus;
+    const char *kind; /* the target's */
+    unsigned count;
+} seeds;
+
+static void add_seed(seeds *s, int choice, const void *bytes, size_t size)
+{
+    char path[PATH_BYTES];
+    snprintf(path, sizeof path, "%s/%s/%04u", s->corpus->folder, s->kind, s->count++);
+    FILE *file = fopen(path, "wb");
+    fuzz_expect(file && (choice < 0 || fputc(choice, file) == choice) && fwrite(bytes, 1, size, file) == size);
+    fclose(file);
+}
+
+static void add_text(seeds *s, int choice, const char *text)
+{
+    add_seed(s, choice, text, strlen(text));
+}
+
+/* Bytes of a file, in memory that the next call uses again. */
+static const uint8_t *load(const char *path, size_t *size)
+{
+    static uint8_t bytes[1 << 17];
+    FILE *file = fopen(path, "rb");
+    fuzz_expect(file != NULL);
+    *size = fread(bytes, 1, sizeof bytes, file);
+    fclose(file);
+    fuzz_expect(*size < sizeof bytes);
+    return bytes;
+}
+
+static void add_file(seeds *s, int choice, const char *path, size_t skipped)
+{
+    size_t size;
+    const uint8_t *bytes = load(path, &size);
+    fuzz_expect(size >= skipped);
+    add_seed(s, choice, bytes + skipped, size - skipped);
+}
+
+static void name_in_folder(const char *name, char path[PATH_BYTES])
+{
+    snprintf(path, PATH_BYTES, "%s/%s", fuzz_folder(), name);
+}
+
+static const tl_run alone = {.threads = 1};
+
+/* ---- Views and rules ---- */
+
+static void add_views(const corpus *c)
+{
+    static const char *const views[] = {
+        "{\"eye\": [11.3, 46.7, 300], \"above_ground\": true, \"heading\": 120, \"pitch\": -5, \"roll\": 1, \"fov\": "
+        "60, "
+        "\"width\": 640, \"height\": 480, \"refraction\": 0.13, \"flat\": false}",
+        "{\"projected\": true, \"views\": [{\"time\": 0, \"eye\": [0, 0, 9]}, {\"time\": 1.5, \"eye\": [1, 2, 9], "
+        "\"target\": [5, 5, 0]}, {\"time\": 3, \"eye\": [4, 4, 1e3], \"target_above_ground\": true}]}",
+        "[{\"eye\": [0, 0, 9]}, {\"eye\": [170, 89, 9]}, {\"eye\": [-170, 89, 9]}]",
+        "{\"asset\": {\"version\": \"2.0\", \"extras\": {\"origin\": {\"longitude\": 11, \"latitude\": 46, \"height\": "
+        "100}, "
+        "\"crs_wkt\": \"GEOGCS[\\\"W\\\",DATUM[\\\"W\\\",SPHEROID[\\\"W\\\",6378137,298.257]],PRIMEM[\\\"G\\\",0],"
+        "UNIT[\\\"degree\\\",0.0174532925199433]]\"}}, \"scene\": 0, \"scenes\": [{\"nodes\": [0]}], \"nodes\": "
+        "[{\"rotation\": "
+        "[0, 0.7, 0, 0.7], \"children\": [1, 2]}, {\"camera\": 0, \"translation\": [5, 100, -5]}, {\"camera\": 0, "
+        "\"matrix\": [1, 0, 0, 0, 0, 0, 1, 0, 0, -1, 0, 0, 7, 8, 9, 1]}], \"cameras\": [{\"type\": \"perspective\", "
+        "\"perspective\": {\"yfov\": 0.8, \"aspectRatio\": 1.5, \"znear\": 1}}]}"};
+    static const char *const rules[] = {
+        "{\"rock\": {\"slope\": [35, 45], \"weight\": 2}, \"scree\": {\"slope\": [25, 30, 38, 45]}, \"soil\": {}, "
+        "\"snow\": {\"height\": [1800, 2200], \"curvature\": [null, null, 0, 0.01], \"sigma\": [0, 1, 2, null]}}",
+        "{\"soil\": {\"weight\": 1e300}, \"rock\": {\"weight\": 0}}"};
+    seeds s = {.corpus = c, .kind = "views"};
+    for (size_t k = 0; k < sizeof views / sizeof *views; k++)
+        add_text(&s, 0, views[k]);
+    for (size_t k = 0; k < sizeof rules / sizeof *rules; k++)
+        add_text(&s, 1, rules[k]);
+    /* the last as a GLB */
+    uint8_t glb[2048] = "glTF\2\0\0";
+    size_t length = strlen(views[3]);
+    fuzz_expect(length + 20 <= sizeof glb);
+    glb[8] = (uint8_t)(length + 20), glb[9] = (uint8_t)((length + 20) >> 8);
+    glb[12] = (uint8_t)length, glb[13] = (uint8_t)(length >> 8);
+    memcpy(glb + 16, "JSON", 4);
+    memcpy(glb + 20, views[3], length);
+    add_seed(&s, 0, glb, length + 20);
+}
+
+/* ---- Meshes, points and tiles ---- */
+
+/* A source that lies somewhere: where the cells of tiles are as wide as its own. */
+static tl_source *placed_model(void)
+{
+    enum { ROW = 12 };
+    static tl_crs *crs; /* of all of them; kept */
+    static float heights[ROW * ROW];
+    tl_source_info info = {.width = ROW, .height = ROW, .type = TL_RASTER_POINT, .name = "placed"};
+    for (int k = 0; k < ROW * ROW; k++)
+        heights[k] = 100 + 10 * sinf((float)(k % ROW)) + (float)(k / ROW);
+    const double transform[6] = {1, 5, 0, 60, 0, -5};
+    memcpy(info.georef.transform, transform, sizeof transform);
+    info.georef.height_unit = 1;
+    info.georef.located = true;
+    info.georef.crs = crs = crs ? crs : tl_crs_create("EPSG:4326", NULL);
+    fuzz_expect(info.georef.crs && tl_georef_measure(&info.georef, ROW, ROW, NULL) == TL_OK);
+    tl_source *source = tl_array_source_create(heights, &info, NULL);
+    fuzz_expect(source != NULL);
+    return source;
+}
+
+static void add_meshes(const corpus *c)
+{
+    static const struct {
+        const char *name;
+        int choice;
+        tl_mesh_coding coding;
+        tl_frame frame;
+    } files[] = {{"m.glb", 0, TL_CODING_PLAIN, TL_FRAME_PIXEL},      {"m.glb", 0, TL_CODING_QUANTIZED, TL_FRAME_PIXEL},
+                 {"m.glb", 0, TL_CODING_COMPRESSED, TL_FRAME_PIXEL}, {"m.obj", 1, TL_CODING_PLAIN, TL_FRAME_PIXEL},
+                 {"m.ply", 2, TL_CODING_PLAIN, TL_FRAME_PIXEL},      {"m.ply", 2, TL_CODING_PLAIN, TL_FRAME_PROJECTED},
+                 {"m.stl", 3, TL_CODING_PLAIN, TL_FRAME_PIXEL},      {"m.stl", 3, TL_CODING_PLAIN, TL_FRAME_PROJECTED}};
+    seeds s = {.corpus = c, .kind = "meshes"};
+    char path[PATH_BYTES];
+    tl_mesh *mesh = NULL;
+    fuzz_expect(tl_mesh_from_source(fuzz_model(), &alone, &mesh, NULL) == TL_OK);
+    for (size_t k = 0; k < sizeof files / sizeof *files; k++) {
+        const tl_write_options options = {
+            .overwrite = true, .coding = files[k].coding, .frame = files[k].frame, .run = &alone};
+        name_in_folder(files[k].name, path);
+        fuzz_expect(tl_write_mesh(mesh, path, &options, NULL) == TL_OK);
+        add_file(&s, files[k].choice, path, 0);
+    }
+    tl_mesh_destroy(mesh);
+    const tl_framework_options options = {.max_error = 5, .run = &alone};
+    tl_framework *framework = tl_framework_build(fuzz_model(), &options, NULL);
+    for (int k = 0; k < 2; k++) {
+        const tl_points_options points = {.overwrite = true, .frame = TL_FRAME_PIXEL, .run = &alone};
+        name_in_folder(k ? "m.geojson" : "m.csv", path);
+        fuzz_expect(framework && tl_framework_save(framework, fuzz_model(), path, &points, NULL) == TL_OK);
+        add_file(&s, 4 + k, path, 0);
+    }
+    tl_framework_destroy(framework);
+    name_in_folder("quantized/0/1/0.terrain", path);
+    add_file(&s, 6, path, 0);
+}
+
+/* ---- Heights, frameworks ---- */
+
+static void add_heights(const corpus *c)
+{
+    static const char *const files[] = {"h.png", "h.r16", "h.raw"};
+    static const char *const beside[] = {"h.json", "h.r16.json", "h.raw.json"};
+    static const uint8_t hgt[] = {0, 1, 0, 2, 128, 0, 255, 255};
+    seeds s = {.corpus = c, .kind = "heights"};
+    char path[PATH_BYTES];
+    tl_source *placed = placed_model();
+    for (int k = 0; k < 6; k++) {
+        const tl_write_options options = {.overwrite = true, .run = &alone};
+        static uint8_t both[1 << 16];
+        size_t json, heights;
+        name_in_folder(files[k % 3], path);
+        fuzz_expect(tl_write_grid(k < 3 ? fuzz_model() : placed, path, &options, NULL) == TL_OK);
+        name_in_folder(beside[k % 3], path);
+        const uint8_t *bytes = load(path, &json);
+        fuzz_expect(json < sizeof both / 2);
+        both[0] = (uint8_t)json, both[1] = (uint8_t)(json >> 8);
+        memcpy(both + 2, bytes, json);
+        name_in_folder(files[k % 3], path);
+        bytes = load(path, &heights);
+        fuzz_expect(json + 2 + heights <= sizeof both);
+        memcpy(both + 2 + json, bytes, heights);
+        add_seed(&s, k % 3, both, json + 2 + heights);
+    }
+    tl_source_destroy(placed);
+    add_seed(&s, 3, hgt, sizeof hgt);
+    add_text(&s, 4, "# names; with ';' for the dot\nN10E010;hgt\nN10E011;hgt\n");
+    add_text(&s, 4, "N1*;hgt\n  S01W00[0-9];hgt\r\n");
+}
+
+static void add_frameworks(const corpus *c)
+{
+    seeds s = {.corpus = c, .kind = "frameworks"};
+    char path[PATH_BYTES];
+    name_in_folder("f.tif", path);
+    for (int k = 0; k < 3; k++) {
+        const tl_framework_options options = {.max_error = 5.0 * k, .run = &alone};
+        const tl_points_options points = {.overwrite = true, .run = &alone};
+        tl_framework *framework = tl_framework_build(fuzz_model(), &options, NULL);
+        fuzz_expect(framework && tl_framework_save(framework, fuzz_model(), path, &points, NULL) == TL_OK);
+        tl_framework_destroy(framework);
+        add_file(&s, -1, path, 0);
+    }
+    for (int k = 0; k < 2; k++) {
+        const tl_pyramid_options options = {.exact = k, .run = &alone};
+        const tl_write_options writing = {.overwrite = true, .run = &alone};
+        tl_pyramid *pyramid = tl_pyramid_create(fuzz_model(), &options, NULL);
+        fuzz_expect(pyramid && tl_pyramid_save(pyramid, path, &writing, NULL) == TL_OK);
+        tl_pyramid_destroy(pyramid);
+        add_file(&s, -1, path, 0);
+    }
+}
+
+/* ---- What tiles leave ---- */
+
+static void make_tiles(tl_tiles_format format, const char *name)
+{
+    char path[PATH_BYTES];
+    const tl_tiles_options options = {.format = format, .run = &alone};
+    tl_tiles_report report;
+    tl_source *placed = placed_model();
+    name_in_folder(name, path);
+    fuzz_expect(tl_write_terrain_tiles(placed, path, &options, &report, NULL) == TL_OK);
+    tl_source_destroy(placed);
+}
+
+static void add_piece(seeds *s, bool heights)
+{
+    enum { CHECKED = 8 }; /* bytes before those that the checksum is of */
+    static float z[OUT_PIECE_ROW * OUT_PIECE_ROW], lost[OUT_PIECE * OUT_PIECE];
+    out_piece_tile tiles[2] = {{.level = 3, .column = 1, .bytes = 100, .triangles = 2, .error = 1},
+                               {.level = 2, .row = 1, .region = {-1, -1, 1, 1, 0, 9}}};
+    const out_piece piece = {.level = 3,
+                             .column = 2,
+                             .row = 1,
+                             .resampling = 0.5,
+                             .tile_count = 2,
+                             .tiles = tiles,
+                             .z = heights ? z : NULL,
+                             .lost = heights ? lost : NULL};
+    char path[PATH_BYTES];
+    name_in_folder(".talus", path);
+    mkdir(path, 0700);
+    name_in_folder(".talus/3_2_1.piece", path);
+    fuzz_expect(out_piece_save(&piece, fuzz_folder(), NULL) == TL_OK);
+    add_file(s, 1, path, CHECKED);
+}
+
+static void add_records(const corpus *c)
+{
+    static const char *const indices[] = {"quantized/layer.json", "spatial/tileset.json", "grids/index.json", "p.json"};
+    seeds s = {.corpus = c, .kind = "records"};
+    char path[PATH_BYTES];
+    const tl_grid_tiles_options grids = {.tile = 3, .run = &alone};
+    const tl_preset_options preset = {.preset = "unity", .overwrite = true, .run = &alone};
+    const tl_noise_options noise = {.size = 40, .hurst = 0.7, .delta = 1};
+    tl_grid_tiles_report report;
+    tl_preset_report made;
+    name_in_folder("grids", path);
+    fuzz_expect(tl_write_grid_tiles(fuzz_model(), path, &grids, &report, NULL) == TL_OK);
+    name_in_folder("p.r16", path);
+    tl_source *wide = tl_noise_create(&noise, NULL);
+    fuzz_expect(wide && tl_write_preset(wide, path, &preset, &made, NULL) == TL_OK);
+    tl_source_destroy(wide);
+    for (size_t k = 0; k < sizeof indices / sizeof *indices; k++) {
+        name_in_folder(indices[k], path);
+        add_file(&s, k ? 0 : 2, path, 0); /* 2: packed, too */
+    }
+    add_piece(&s, false);
+    add_piece(&s, true);
+}
+
+/* ---- Command lines ---- */
+
+/* In the order of fuzz_options.c. */
+static const char *const names[] = {"info", "simplify", "synth", "preview", "noise", "stats",
+                                    "view", "fly",      "tiles", "serve",   "report"};
+
+/* A word a line, without the quotes of a shell. */
+static void add_line(seeds *s, const char *line, size_t size)
+{
+    char words[4096];
+    size_t used = 0, name = strcspn(line, " \n");
+    int choice = 0;
+    const int count = sizeof names / sizeof *names;
+    while (choice < count && (strlen(names[choice]) != name || memcmp(names[choice], line, name) != 0))
+        choice++;
+    for (size_t k = name + 1; k < size && used < sizeof words; k++)
+        if (line[k] != '\'' && line[k] != '"' && (line[k] != '\n' || k + 1 < size))
+            words[used++] = line[k] == ' ' ? '\n' : line[k];
+    if (choice < count)
+        add_seed(s, choice, words, used);
+}
+
+static void add_options(const corpus *c, const char *golden)
+{
+    seeds s = {.corpus = c, .kind = "options"};
+    DIR *folder = opendir(golden);
+    fuzz_expect(folder != NULL);
+    for (const struct dirent *entry; (entry = readdir(folder));) {
+        char path[PATH_BYTES];
+        const char *dot = strrchr(entry->d_name, '.');
+        size_t size;
+        if (!dot || strcmp(dot, ".args") != 0)
+            continue;
+        snprintf(path, sizeof path, "%s/%s", golden, entry->d_name);
+        const uint8_t *bytes = load(path, &size);
+        char line[4096] = "";
+        if (size < sizeof line) {
+            memcpy(line, bytes, size);
+            add_line(&s, line, size);
+        }
+    }
+    closedir(folder);
+    fuzz_expect(s.count > 0);
+}
+
 int main(int argc, char **argv)
 {
-    if (argc != 2) {
-        fprintf(stderr, "make_corpus FOLDER\n");
+    if (argc != 3) {
+        fprintf(stderr, "make_corpus FOLDER GOLDEN\n");
         return 2;
     }
     static corpus c;
     char path[PATH_BYTES];
-    static const char *const parts[] = {"", "/raster", "/exr"};
+    static const char *const parts[] = {"",         "/raster",     "/exr",     "/views",  "/meshes",
+                                        "/heights", "/frameworks", "/records", "/options"};
     snprintf(c.folder, sizeof c.folder, "%s", argv[1]);
-    for (int k = 0; k < 3; k++) {
+    for (size_t k = 0; k < sizeof parts / sizeof *parts; k++) {
         snprintf(path, sizeof path, "%s%s", c.folder, parts[k]);
         mkdir(path, 0777);
     }
@@ -226,6 +539,14 @@ int main(int argc, char **argv)
     add_georeferences(&c);
     add_exrs(&c);
     add_large_exr(&c);
-    printf("%u TIFFs, %u EXRs in %s\n", c.tiffs, c.exrs, c.folder);
+    make_tiles(TL_TILES_QUANTIZED_MESH, "quantized");
+    make_tiles(TL_TILES_3D, "spatial");
+    add_views(&c);
+    add_meshes(&c);
+    add_heights(&c);
+    add_frameworks(&c);
+    add_records(&c);
+    add_options(&c, argv[2]);
+    printf("%u TIFFs, %u EXRs and the seeds of the other targets in %s\n", c.tiffs, c.exrs, c.folder);
     return c.failed || !c.tiffs || !c.exrs;
 }

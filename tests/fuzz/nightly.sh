@@ -1,4 +1,4 @@
 #!/bin/sh
-# Ten minutes of fuzzing, for a nightly run.
+# Forty minutes of fuzzing, ten for each target, for a nightly run.
 #   tests/fuzz/nightly.sh [FOLDER]
-exec "$(dirname "$0")/run.sh" 600 "$@"
+exec "$(dirname "$0")/run.sh" 2400 "$@"
