@@ -11,6 +11,7 @@
 #include <math.h>
 #include <stdio.h>
 #include <string.h>
+#include <sys/stat.h>
 
 enum { KINDS = 5, TILE_HEAD = 88, MOST_TILE_BYTES = 1 << 26 };
 
@@ -180,8 +181,10 @@ typedef struct tile {
 
 static uint32_t word_at(const tile *t, size_t at)
 {
+    if (at + 4 > t->count)
+        return 0;
     const unsigned char *p = t->bytes + at;
-    return at + 4 <= t->count ? p[0] | (uint32_t)p[1] << 8 | (uint32_t)p[2] << 16 | (uint32_t)p[3] << 24 : 0;
+    return p[0] | (uint32_t)p[1] << 8 | (uint32_t)p[2] << 16 | (uint32_t)p[3] << 24;
 }
 
 static float float_at(const tile *t, size_t at)
@@ -206,18 +209,17 @@ static tl_status unpack(const char *path, const unsigned char *packed, size_t co
 
 static tl_status read_tile(const char *path, tile *out, tl_error *error)
 {
+    struct stat there;
     FILE *file = fopen(path, "rb");
-    unsigned char *packed = malloc(MOST_TILE_BYTES);
-    if (!file || !packed) {
-        int code = errno;
-        free(packed);
-        if (file)
-            fclose(file);
-        return file ? tl_fail_memory(error, path) : tl_fail_system(error, path, "read", code);
-    }
-    size_t count = fread(packed, 1, MOST_TILE_BYTES, file);
+    if (!file)
+        return tl_fail_system(error, path, "read", errno);
+    bool sound = fstat(fileno(file), &there) == 0 && S_ISREG(there.st_mode) && there.st_size <= MOST_TILE_BYTES;
+    unsigned char *packed = sound ? malloc((size_t)there.st_size + 1) : NULL;
+    size_t count = packed ? fread(packed, 1, (size_t)there.st_size, file) : 0;
     fclose(file);
-    tl_status status = unpack(path, packed, count, out, error);
+    tl_status status = !sound    ? strange(path, "no file, or larger than a tile can be", error)
+                       : !packed ? tl_fail_memory(error, path)
+                                 : unpack(path, packed, count, out, error);
     free(packed);
     return status;
 }
