@@ -876,8 +876,10 @@ static void energy(const float *heights, fbm_window in, float *out, fbm_window o
     gather(energies, stride, o.width, o.height, rows, sums);
     gather(known, stride, o.width, o.height, rows, weights);
     for (size_t r = 0; r < o.height; r++)
-        for (size_t k = 0; k < o.width; k++)
-            out[r * o.stride + k] = sums[r * o.width + k] / weights[r * o.width + k]; /* 0/0 is NaN */
+        for (size_t k = 0; k < o.width; k++) { /* NaN where nothing is known, but not by a division by 0 */
+            float weight = weights[r * o.width + k];
+            out[r * o.stride + k] = (weight > 0 ? sums[r * o.width + k] : NAN) / (weight > 0 ? weight : 1);
+        }
 }
 
 extern const fbm_relief_kernel JOIN(fbm_relief_kernel_, FBM_KERNEL);

@@ -306,8 +306,8 @@ double scene_view_pixels(const scene_view *view, double length, double distance)
     /* Two points at least `distance` away and `length` apart are seen under an angle of 2 asin(x) at most, x = length /
      * (2 distance); asin(x) <= x + (pi / 2 - 1) x^3 on 0 ... 1. An angle t becomes focal t / cos^2 at most, by the
      * angle from straight ahead in the corner of the screen. */
-    double x = length / (2 * distance);
-    if (!(x < 1))
+    if (!(length < 2 * distance))
         return length > 0 ? (double)INFINITY : 0;
+    double x = length / (2 * distance);
     return view->camera.focal * view->widest * 2 * (x + 0.5708 * x * x * x);
 }
