@@ -139,8 +139,9 @@ static const tl_source *refine(const settings *set, const tl_source *dem, const 
     return set->extra ? *field : dem;
 }
 
-static int make_tiles(const settings *set, const arguments *inputs, tl_tiles_options *options)
+static int make_tiles(const settings *set, const arguments *inputs, const tl_tiles_options *wanted)
 {
+    tl_tiles_options options = *wanted;
     if (set->mbtiles && access(set->mbtiles, F_OK) == 0) { /* told before the work */
         complain("%s: exists already; name another file or remove it", set->mbtiles);
         return EXIT_FAILED;
@@ -155,7 +156,7 @@ static int make_tiles(const settings *set, const arguments *inputs, tl_tiles_opt
         return command_failed(&bar, &error);
     progress_stage(&bar, "measuring");
     const tl_source *source = refine(set, opened.source, &run, &field, &error);
-    options->run = &run;
+    options.run = &run;
     int status = EXIT_DONE;
     if (source)
         progress_stage(&bar, "tiles");
@@ -164,7 +165,7 @@ static int make_tiles(const settings *set, const arguments *inputs, tl_tiles_opt
             progress_end(&bar);
         else
             status = command_failed(&bar, &error);
-    } else if (!source || tl_write_terrain_tiles(source, set->common.output, options, &made, &error) != TL_OK)
+    } else if (!source || tl_write_terrain_tiles(source, set->common.output, &options, &made, &error) != TL_OK)
         status = command_failed(&bar, &error);
     else {
         report(set, &made, progress_end(&bar));

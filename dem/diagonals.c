@@ -345,7 +345,7 @@ static tl_status turn_all(turner *self, tl_diagonal_report *out, tl_error *error
 tl_status tl_mesh_lower_diagonals(tl_mesh *mesh, const tl_source *dem, const tl_diagonal_options *options,
                                   tl_diagonal_report *out, tl_error *error)
 {
-    tl_error own;
+    tl_error own = {0};
     error = error ? error : &own; /* it tells why a frame is none */
     if (mesh->triangle_count > UINT32_MAX - 1)
         return tl_fail(error, TL_ERROR_ARGUMENT, "%s: %zu triangles are too many to be turned; use a larger max_error",

@@ -710,7 +710,7 @@ static tl_status count_uncovered(const builder *self, const tl_mesh *mesh, uint6
 tl_status tl_simplify(const tl_source *dem, const tl_simplify_options *options, tl_mesh **out, uint64_t *uncovered,
                       tl_error *error)
 {
-    tl_error own;
+    tl_error own = {0};
     error = error ? error : &own; /* it tells why a framework is none */
     bool cells = dem->info.width > 1 && dem->info.height > 1;
     if (!cells || (options->kind == TL_MESH_QUADTREE && !options->canonical_borders))

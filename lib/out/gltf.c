@@ -16,6 +16,7 @@
 #include <jansson.h>
 
 #include <math.h>
+#include <stddef.h>
 #include <stdio.h>
 #include <string.h>
 #include <unistd.h>
@@ -544,8 +545,8 @@ static bool add_packed(model *m)
         longest = sqrt(longest);
         for (int a = 0; a < 3; a++)
             to.normal[a] = (int16_t)lrint(longest > 0 ? 32767 * n[a] / longest : a == 1 ? 32767 : 0);
-        memcpy(positions->bytes + 8 * k, to.position, 8);
-        memcpy(normals->bytes + 8 * k, to.normal, 8);
+        memcpy(positions->bytes + 8 * k, &to, 8);
+        memcpy(normals->bytes + 8 * k, (const unsigned char *)&to + offsetof(packed, normal), 8);
     }
     return normals;
 }

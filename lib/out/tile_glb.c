@@ -198,7 +198,7 @@ static int make_views(out_glb_encoder *e, const out_glb_tile *t, size_t vertices
     size_t indices = e->surface.index_count;
     bool wide = vertices > STEPS; /* the last number of 16 bits is a mark in some interfaces */
     for (size_t k = 0; k < vertices; k++) {
-        memcpy(e->parts[POSITIONS] + 8 * k, e->vertices[k].position, 8);
+        memcpy(e->parts[POSITIONS] + 8 * k, &e->vertices[k], 8); /* the position, and what fills up */
         memcpy(e->parts[NORMALS] + 4 * k, e->vertices[k].normal, 4);
         memcpy(e->parts[TANGENTS] + 4 * k, e->vertices[k].tangent, 4);
         memcpy(e->parts[PLACES] + 4 * k, e->vertices[k].uv, 4);

@@ -16,9 +16,11 @@ build() { # NAME OPTION...
     ninja -C "$folder/$name" --quiet
 }
 
-echo "== cppcheck (a list to read; see doc/analysis.md)"
-(cd "$here" && cppcheck --enable=warning,portability --std=c11 -I . -DTL_HAVE_CAIRO -DTL_HAVE_MICROHTTPD --quiet \
-    --cppcheck-build-dir="$folder/cppcheck" --template='{file}:{line}: {id}: {message}' lib dem fbm cmd)
+echo "== cppcheck"
+(cd "$here" && cppcheck --enable=warning,portability --std=c11 -I . -DTL_HAVE_CAIRO -DTL_HAVE_MICROHTTPD -DTL_HAVE_SQLITE \
+    --include=tests/analysis/cppcheck.h --quiet --error-exitcode=1 \
+    --suppressions-list=tests/analysis/cppcheck.supp --cppcheck-build-dir="$folder/cppcheck" \
+    --template='{file}:{line}: {id}: {message}' lib dem fbm cmd) || failed=1
 
 echo "== valgrind"
 build plain --buildtype=debugoptimized -Dtests=false
