@@ -76,7 +76,7 @@ static json_t *string(const char *text)
 }
 
 /* Corners of the footprint, in place of sample positions; NaN where they have no longitude and latitude. */
-static void find_corners(facts *f)
+static tl_status find_corners(facts *f, tl_error *error)
 {
     const tl_source_info *info = f->info;
     double margin = info->type == TL_RASTER_AREA ? 0.5 : 0;
@@ -84,10 +84,10 @@ static void find_corners(facts *f)
     const double i[4] = {-margin, right, right, -margin}, j[4] = {-margin, -margin, bottom, bottom};
     memcpy(f->corner_lon, i, sizeof i);
     memcpy(f->corner_lat, j, sizeof j);
-    if (tl_georef_to_lonlat(&info->georef, 4, f->corner_lon, f->corner_lat, NULL) == TL_OK)
-        return;
-    for (int k = 0; k < 4; k++)
+    tl_status status = tl_georef_to_lonlat(&info->georef, 4, f->corner_lon, f->corner_lat, error);
+    for (int k = 0; k < 4 && status != TL_OK; k++)
         f->corner_lon[k] = f->corner_lat[k] = (double)NAN;
+    return status;
 }
 
 static void add_degrees(json_t *object, const facts *f)
@@ -358,16 +358,19 @@ static void print_text(const facts *f)
                info->parameters[i].value);
 }
 
-/* All that is known without reading samples. */
-static void look(facts *f)
+/* All that is known without reading samples. What cannot be told is left out, but for want of memory. */
+static tl_status look(facts *f, tl_error *error)
 {
     f->has_details = tl_dem_get_details(f->source, &f->details, NULL) == TL_OK;
-    f->has_bounds = tl_source_bounds(f->info, f->bounds, NULL) == TL_OK;
-    find_corners(f);
+    tl_status status = tl_source_bounds(f->info, f->bounds, error);
+    f->has_bounds = status == TL_OK;
+    if (status == TL_ERROR_MEMORY || find_corners(f, error) == TL_ERROR_MEMORY)
+        return TL_ERROR_MEMORY;
     if (f->has_details)
         tl_dem_get_overviews(f->source, f->overviews, MAX_OVERVIEWS, &f->overview_count, NULL);
     f->has_cost = f->has_window && f->window.x + f->window.width <= f->source->info.width &&
                   tl_dem_get_cost(f->source, f->window, &f->cost, NULL) == TL_OK;
+    return TL_OK;
 }
 
 static int inform(const settings *set, const arguments *inputs)
@@ -384,8 +387,7 @@ static int inform(const settings *set, const arguments *inputs)
     f.window = opened.window;
     int status = EXIT_DONE;
     progress_stage(&bar, "reading");
-    look(&f);
-    if (tl_source_range(source, &run, &f.range, &error) != TL_OK ||
+    if (look(&f, &error) != TL_OK || tl_source_range(source, &run, &f.range, &error) != TL_OK ||
         tl_source_suspects(source, &run, f.suspects, &f.suspect_count, &error) != TL_OK ||
         tl_roughness_measure(source, &run, &f.roughness, &error) != TL_OK)
         status = command_failed(&bar, &error);

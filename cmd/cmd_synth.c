@@ -297,11 +297,11 @@ static int write_out(settings *set, const tl_source *made, const tl_run *run, pr
 {
     tl_error error;
     progress_stage(bar, "synthesis");
+    note_output(set); /* while there is memory for it */
     if (check_layers(set, made, &error) != TL_OK || write_grid(set, made, run, &error) != TL_OK)
         return command_failed(bar, &error);
     report(set, made, progress_end(bar));
     if (write_layers(set, made, run, bar, &error) != TL_OK) {
-        note_output(set);
         for (size_t k = 0; k < set->file_count; k++) /* a failed run leaves nothing */
             unlink(set->files[k]);
         return command_failed(bar, &error);

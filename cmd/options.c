@@ -310,8 +310,10 @@ parse_result options_parse(const char *command, int argc, const char **argv, con
     }
     if (context)
         poptFreeContext(context);
-    if (result == PARSE_OK)
-        rest->record = record_make(command, flat, count, rest->before, rest);
+    if (result == PARSE_OK && !(rest->record = record_make(command, flat, count, rest->before, rest))) {
+        complain("not enough memory for the options");
+        result = PARSE_FAILED;
+    }
     return result;
 }
 

@@ -355,5 +355,9 @@ char *dem_tiff_text(TIFF *tiff, uint32_t tag)
 {
     size_t count;
     const char *text = dem_tiff_array(tiff, tag, TIFF_ASCII, &count);
-    return text ? strndup(text, count) : NULL;
+    char *copy = text ? strndup(text, count) : NULL;
+    dem_tiff_handle *handle = TIFFClientdata(tiff);
+    if (text && !copy && !handle->trouble)
+        handle->trouble = ENOMEM;
+    return copy;
 }

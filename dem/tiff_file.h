@@ -50,8 +50,8 @@ void dem_tiff_drop(dem_tiff_file *file, dem_tiff_handle *handle);
 void *dem_tiff_scratch(dem_tiff_handle *handle, size_t bytes);
 
 void dem_tiff_forget(dem_tiff_handle *handle);
-/* TL_ERROR_IO, described, where the system has failed to read for this handle: libtiff takes a tag that it cannot read
- * for one that is not there, and goes on. */
+/* An error, described, where the system has failed to read for this handle, or to give memory for a tag: libtiff takes
+ * a tag that it cannot read for one that is not there, and goes on. */
 tl_status dem_tiff_check(const dem_tiff_handle *handle, tl_error *error);
 /* What libtiff said, or `otherwise` where it said nothing. */
 const char *dem_tiff_message(const dem_tiff_handle *handle, const char *otherwise);
@@ -59,7 +59,8 @@ const char *dem_tiff_message(const dem_tiff_handle *handle, const char *otherwis
 /* The values of an array tag that libtiff may or may not know, as `type` (TIFF_SHORT, TIFF_DOUBLE or TIFF_ASCII);
  * NULL where the tag is absent or of another type. They belong to the handle and live until its directory changes. */
 const void *dem_tiff_array(TIFF *tiff, uint32_t tag, TIFFDataType type, size_t *count);
-/* The text of an ASCII tag as a string of its own, ended by a zero; NULL where there is none or no memory. */
+/* The text of an ASCII tag as a string of its own, ended by a zero; NULL where there is none, or no memory, which
+ * dem_tiff_check tells. */
 char *dem_tiff_text(TIFF *tiff, uint32_t tag);
 
 #endif
