@@ -117,8 +117,8 @@ static bool is_default(const option *o, const option_value *now, const option_va
     return !(o->given && *o->given) && memcmp(now, before, record_value_size(o)) == 0;
 }
 
-/* A name without folders; one that would be an option is put so that it is none. */
-static void put_name(FILE *to, const char *path)
+/* A name without folders; one that would be an option is put so that it is none. False: there is no memory. */
+static bool put_name(FILE *to, const char *path)
 {
     const char *name = without_folders(path);
     size_t room = strlen(name) + 3;
@@ -127,7 +127,9 @@ static void put_name(FILE *to, const char *path)
         snprintf(safe, room, "%s%s", *name == '-' ? "./" : "", name);
         put_word(to, safe);
     }
+    bool put = safe != NULL;
     free(safe);
+    return put;
 }
 
 char *record_make(const char *command, const option *const *options, size_t count, const option_value *before,
@@ -147,9 +149,10 @@ char *record_make(const char *command, const option *const *options, size_t coun
         fprintf(to, " --%s", options[k]->name);
         put_value(to, options[k], &now);
     }
+    bool whole = true;
     for (size_t k = 0; k < rest->count; k++)
-        put_name(to, rest->names[k]);
-    bool whole = !ferror(to);
+        whole &= put_name(to, rest->names[k]);
+    whole &= !ferror(to);
     if (fclose(to) == 0 && whole)
         return text;
     free(text);
