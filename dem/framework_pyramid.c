@@ -467,6 +467,14 @@ static void store_block(const builder *self, const block_place *at, uint64_t ite
     }
 }
 
+/* Whether all errors of a block are 0: all of it is in one plane, and no triangle of it reaches over the raster's rim.
+ */
+static bool is_level(const builder *self, const block_place *at, const block_facts *facts)
+{
+    return facts->low == facts->high && !facts->voids && at->width == self->side && at->height == self->side &&
+           !shifts(self);
+}
+
 static tl_status find_block(void *context, tl_parallel *loop, uint64_t item, unsigned worker, tl_error *error)
 {
     builder *self = context;
@@ -498,7 +506,9 @@ static tl_status find_block(void *context, tl_parallel *loop, uint64_t item, uns
                             .parts = own->parts};
     for (int k = 0; k < 4; k++)
         own->errors[(k >> 1) * self->side * TL_ERROR_STRIDE + (k & 1) * self->side] = 0;
-    if (self->side > 1)
+    if (is_level(self, &at, facts))
+        memset(own->errors, 0, (size_t)TL_ERROR_STRIDE * TL_ERROR_STRIDE * sizeof *own->errors);
+    else if (self->side > 1)
         self->kernel->block(&block, self->side);
     store_block(self, &at, item, own->errors);
     float middle = own->errors[self->side / 2 * TL_ERROR_STRIDE + self->side / 2];

@@ -2,7 +2,9 @@
  * read with it. */
 #include "dem/crs.h"
 #include "dem/crs_ellipsoidal.h"
+#include "lib/base/georef.h"
 #include "lib/scene/geodetic.h"
+#include "lib/scene/source_part.h"
 #include "lib/talus.h"
 
 #include <math.h>
@@ -227,6 +229,46 @@ static void heightsAreMetres(void **state)
     close_ground(source, heights);
 }
 
+/* Rows and columns that are done together come out as positions one by one: at the rim, beyond it, and beside voids. */
+static void gridsAreTheirPoints(void **state)
+{
+    (void)state;
+    enum { SIDE = 40, COLUMNS = SCENE_PART_MOST, ROWS = 190 };
+    float z[SIDE * SIDE], *out = malloc((COLUMNS + 3) * ROWS * sizeof *out);
+    double x[COLUMNS], y[ROWS];
+    for (int k = 0; k < SIDE * SIDE; k++)
+        z[k] = k % 37 == 5 || (k > 800 && k < 850) ? NAN : (float)(900 * sin(0.7 * k) + 0.01 * k * k);
+    for (int k = 0; k < COLUMNS; k++)
+        x[k] = k % 61 == 7 ? (double)NAN : -1.2 + 0.165 * k;
+    for (int k = 0; k < ROWS; k++)
+        y[k] = k == 90 ? (double)NAN : SIDE + 0.3 - 0.22 * k;
+    size_t known = 0;
+    for (int kind = 0; kind < 4; kind++) {
+        const tl_source_info info = {.width = SIDE,
+                                     .height = SIDE,
+                                     .type = kind & 1 ? TL_RASTER_AREA : TL_RASTER_POINT,
+                                     .wraps = kind > 1,
+                                     .georef = tl_georef_none(),
+                                     .name = "samples"};
+        tl_source *source = tl_array_source_create(z, &info, NULL);
+        scene_part part = {.z = NULL};
+        assert_true(scene_part_find_grid(&info, COLUMNS, x, ROWS, y, &part.window));
+        part.z = malloc((size_t)(part.window.width * part.window.height) * sizeof *part.z);
+        assert_int_equal(scene_part_read(source, &part, NULL), TL_OK);
+        scene_part_heights(&part, &info, COLUMNS, x, ROWS, y, out, COLUMNS + 3);
+        for (int k = 0; k < COLUMNS * ROWS; k++) {
+            float one = scene_part_height(&part, &info, x[k % COLUMNS], y[k / COLUMNS]);
+            const float *in = &out[k / COLUMNS * (COLUMNS + 3) + k % COLUMNS];
+            assert_true(isnan(one) ? isnan(*in) : memcmp(in, &one, sizeof one) == 0);
+            known += !isnan(one);
+        }
+        free(part.z);
+        tl_source_destroy(source);
+    }
+    assert_true(known > COLUMNS * ROWS);
+    free(out);
+}
+
 static void whatHasNoPlaceIsRefused(void **state)
 {
     (void)state;
@@ -246,7 +288,7 @@ int main(void)
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(nothingIsShifted),         cmocka_unit_test(verticesDoNotDependOnTheWindow),
         cmocka_unit_test(levelsShareTheirVertices), cmocka_unit_test(heightsAreMetres),
-        cmocka_unit_test(whatHasNoPlaceIsRefused),
+        cmocka_unit_test(gridsAreTheirPoints),      cmocka_unit_test(whatHasNoPlaceIsRefused),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }

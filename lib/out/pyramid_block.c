@@ -51,48 +51,86 @@ static float mean_around(const float *z, int x, int y)
     return count ? (float)(sum / count) : NAN;
 }
 
-/* Where the known heights of a row lie; first > last: nowhere. */
+/* Where the known heights of a row lie, first > last: nowhere; and which of them have none unknown between them. */
 typedef struct reach {
-    int first, last;
+    int first, last, solid_first, solid_last;
 } reach;
 
-static reach reach_of(const float *z, int y)
+static reach reach_of(const float *row)
 {
-    const float *row = z + (size_t)y * WIDE;
-    reach out = {0, WIDE - 1};
+    reach out = {0, WIDE - 1, 0, WIDE - 1};
     while (out.first < WIDE && !isfinite(row[out.first]))
         out.first++;
     while (out.last > out.first && !isfinite(row[out.last]))
         out.last--;
-    return out.first < WIDE ? out : (reach){WIDE, -2};
+    if (out.first == WIDE)
+        return (reach){WIDE, -1, WIDE, -1};
+    out.solid_first = out.solid_last = out.first;
+    while (out.solid_last < out.last && isfinite(row[out.solid_last + 1]))
+        out.solid_last++;
+    return out;
 }
 
-static reach join(reach a, reach b)
+/* The columns of row y that have something known around them, or in them. */
+static reach near_row(const reach *rows, int y)
 {
-    return (reach){a.first < b.first ? a.first : b.first, a.last > b.last ? a.last : b.last};
-}
-
-/* One vertex outwards. `rows` has room for two rows, those as they were. */
-static void grow(float *z, float *rows)
-{
-    float *fresh = rows, *last = rows + WIDE;
-    for (int y = 0; y < WIDE; y++) {
-        reach near = reach_of(z, y);
-        for (int k = -1; k <= 1; k += 2)
-            if (y + k >= 0 && y + k < WIDE)
-                near = join(near, reach_of(z, y + k));
-        memcpy(fresh, z + (size_t)y * WIDE, WIDE * sizeof *z);
-        for (int x = near.first > 0 ? near.first - 1 : 0; x <= near.last + 1 && x < WIDE; x++)
-            if (!isfinite(fresh[x]))
-                fresh[x] = mean_around(z, x, y);
-        /* the row before is not looked at any more */
-        if (y)
-            memcpy(z + (size_t)(y - 1) * WIDE, last, WIDE * sizeof *z);
-        float *swapped = fresh;
-        fresh = last;
-        last = swapped;
+    reach out = rows[y];
+    for (int k = y > 0 ? y - 1 : 0; k <= y + 1 && k < WIDE; k++) {
+        out.first = rows[k].first < out.first ? rows[k].first : out.first;
+        out.last = rows[k].last > out.last ? rows[k].last : out.last;
     }
-    memcpy(z + (size_t)(WIDE - 1) * WIDE, last, WIDE * sizeof *z);
+    if (out.first <= out.last) {
+        out.first -= out.first > 0;
+        out.last += out.last < WIDE - 1;
+    }
+    return out;
+}
+
+/* Row y as it will be; false: as it is. */
+static bool grow_row(const float *z, int y, const reach *near, float *out)
+{
+    if (near->first > near->last || (near->solid_first == near->first && near->solid_last == near->last))
+        return false;
+    memcpy(out, z + (size_t)y * WIDE, WIDE * sizeof *z);
+    for (int x = near->first; x <= near->last; x++) {
+        if (x == near->solid_first)
+            x = near->solid_last;
+        else if (!isfinite(out[x]))
+            out[x] = mean_around(z, x, y);
+    }
+    return true;
+}
+
+/* One vertex outwards. `rows` has room for two rows; reaches are those of the rows, and become those of what has
+ * grown. */
+static void grow(float *z, float *rows, reach *reaches, reach *grown)
+{
+    bool waits = false; /* the row before, which is looked at until this one is done */
+    for (int y = 0; y <= WIDE; y++) {
+        bool changes = false;
+        if (y < WIDE) {
+            grown[y] = near_row(reaches, y);
+            changes = grow_row(z, y, &grown[y], rows + y % 2 * WIDE);
+        }
+        if (waits)
+            memcpy(z + (size_t)(y - 1) * WIDE, rows + (y - 1) % 2 * WIDE, WIDE * sizeof *z);
+        waits = changes;
+    }
+    memcpy(reaches, grown, WIDE * sizeof *reaches);
+}
+
+static tl_status grow_all(float *z, tl_error *error)
+{
+    float *rows = tl_alloc(2 * WIDE, sizeof *rows);
+    reach *reaches = tl_alloc(2 * WIDE, sizeof *reaches);
+    for (int y = 0; reaches && y < WIDE; y++)
+        reaches[y] = reach_of(z + (size_t)y * WIDE);
+    for (int k = 0; rows && reaches && k < GROWTH; k++)
+        grow(z, rows, reaches, reaches + WIDE);
+    bool done = rows && reaches;
+    free(rows);
+    free(reaches);
+    return done ? TL_OK : tl_fail_memory(error, "a block of tiles");
 }
 
 /* The last vertices of a lattice that have samples, or lie beside the last: what is beyond copies them. */
@@ -126,20 +164,29 @@ static void go_on_beyond(const out_pyramid *p, const out_block_place *at, out_bl
     }
 }
 
+/* Whether all of a row's heights are known, and which. */
+static bool find_known_row(const float *z, unsigned char *known)
+{
+    unsigned all = 1;
+    for (int x = 0; x < ROW; x++) {
+        known[x] = isfinite(z[x]) != 0;
+        all &= known[x];
+    }
+    return all != 0;
+}
+
 /* Fills in what is known; *empty: nothing is in the block's core. Whether all is. */
 static bool find_known(out_block_worker *w, bool *empty)
 {
     bool all = true;
     *empty = true;
-    for (int y = 0; y < ROW; y++)
-        for (int x = 0; x < ROW; x++) {
-            bool known = isfinite(w->wide[(y + GROWTH) * WIDE + x + GROWTH]);
-            w->known[y * ROW + x] = known;
-            all = all && known;
-            if (known && x >= SCENE_RIM && y >= SCENE_RIM && x <= SCENE_RIM + SCENE_BLOCK &&
-                y <= SCENE_RIM + SCENE_BLOCK)
-                *empty = false;
-        }
+    for (int y = 0; y < ROW; y++) {
+        unsigned char *known = w->known + (size_t)y * ROW;
+        bool row = find_known_row(w->wide + (size_t)(y + GROWTH) * WIDE + GROWTH, known);
+        all = all && row;
+        if (*empty && y >= SCENE_RIM && y <= SCENE_RIM + SCENE_BLOCK)
+            *empty = !memchr(known + SCENE_RIM, 1, SCENE_BLOCK + 1);
+    }
     return all;
 }
 
@@ -149,20 +196,16 @@ static tl_status take_heights(const out_pyramid *p, const out_block_place *at, o
 {
     if (!p->scheme->covers)
         go_on_beyond(p, at, w);
-    bool all = find_known(w, empty), grows = p->scheme->covers && !all && !*empty;
-    float *rows = grows ? tl_alloc(2 * WIDE, sizeof *rows) : NULL;
-    if (grows && !rows)
-        return tl_fail_memory(error, "a block of tiles");
-    for (int k = 0; rows && k < GROWTH; k++)
-        grow(w->wide, rows);
-    free(rows);
+    bool all = find_known(w, empty);
+    tl_status status = p->scheme->covers && !all && !*empty ? grow_all(w->wide, error) : TL_OK;
     const float outside = p->scheme->covers ? (float)p->options->outside : NAN;
-    for (int y = 0; y < ROW; y++)
-        for (int x = 0; x < ROW; x++) {
-            float z = w->wide[(y + GROWTH) * WIDE + x + GROWTH];
-            w->block.z[y * ROW + x] = isfinite(z) ? z : outside;
-        }
-    return TL_OK;
+    for (int y = 0; y < ROW; y++) {
+        const float *z = w->wide + (size_t)(y + GROWTH) * WIDE + GROWTH;
+        float *out = w->block.z + (size_t)y * ROW;
+        for (int x = 0; x < ROW; x++)
+            out[x] = isfinite(z[x]) ? z[x] : outside;
+    }
+    return status;
 }
 
 static tl_status read_heights(const out_pyramid *p, const out_block_place *at, out_block_worker *w, tl_error *error)

@@ -98,8 +98,9 @@ static void find_trigonometry(const out_terrain_tile *tile, trigonometry *t)
     }
     t->low = HUGE_VAL, t->high = -HUGE_VAL;
     for (size_t k = 0; k < tile->mesh->vertex_count; k++) {
-        t->low = fmin(t->low, (double)tile->mesh->vertices[k].z);
-        t->high = fmax(t->high, (double)tile->mesh->vertices[k].z);
+        double z = (double)tile->mesh->vertices[k].z;
+        t->low = z < t->low ? z : t->low;
+        t->high = z > t->high ? z : t->high;
     }
 }
 
@@ -119,6 +120,11 @@ static void place_vertex(const out_terrain_tile *tile, const trigonometry *t, si
     place(t, v->i, v->j, (double)v->z, out);
 }
 
+static double greater(double a, double b)
+{
+    return a > b ? a : b;
+}
+
 static double dot(const double a[3], const double b[3])
 {
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -133,8 +139,9 @@ static void find_ball(const out_terrain_tile *tile, trigonometry *t)
     for (size_t k = 0; k < tile->mesh->vertex_count; k++) {
         place_vertex(tile, t, k, p);
         const double d[3] = {p[0] - t->centre[0], p[1] - t->centre[1], p[2] - t->centre[2]};
-        t->radius = fmax(t->radius, sqrt(dot(d, d)));
+        t->radius = greater(t->radius, dot(d, d));
     }
+    t->radius = sqrt(t->radius);
 }
 
 /* The point that lies behind the horizon only where the whole tile does: in the direction of the ball's centre, where
@@ -154,9 +161,9 @@ static void find_horizon(const out_terrain_tile *tile, const trigonometry *t, do
         for (int a = 0; a < 3; a++)
             p[a] /= radii[a];
         double square = dot(p, p), along = dot(p, direction) / sqrt(square);
-        double magnitude = sqrt(fmax(square, 1)), across = sqrt(fmax(1 - along * along, 0));
-        double near = along / magnitude - across * sqrt(fmax(square, 1) - 1) / magnitude;
-        farthest = fmax(farthest, near > 1 / far_away ? 1 / near : far_away);
+        double magnitude = sqrt(greater(square, 1)), across = sqrt(greater(1 - along * along, 0));
+        double near = along / magnitude - across * sqrt(greater(square, 1) - 1) / magnitude;
+        farthest = greater(farthest, near > 1 / far_away ? 1 / near : far_away);
     }
     for (int a = 0; a < 3; a++)
         out[a] = direction[a] * farthest;

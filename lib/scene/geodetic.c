@@ -6,6 +6,7 @@
 #include "lib/base/error.h"
 #include "lib/base/georef.h"
 #include "lib/base/size.h"
+#include "lib/scene/source_part.h"
 
 #include <math.h>
 #include <pthread.h>
@@ -23,6 +24,7 @@ struct scene_geodetic {
     int level;
     double meridian;   /* of the CRS, degrees east of Greenwich */
     double inverse[4]; /* from CRS coordinates to samples */
+    bool upright;      /* columns and rows of vertices are columns and rows of samples */
     tl_window window;
     dem_control_grid *grid;     /* vertex to sample; NULL: one by one */
     pthread_mutex_t lock;       /* of the projection */
@@ -138,6 +140,7 @@ static tl_status begin(scene_geodetic *g, tl_error *error)
         g->projection = dem_projection_create(georef->crs, error);
     if (!g->projection && !tl_crs_is_geographic(georef->crs))
         return TL_ERROR_DATA;
+    g->upright = !g->projection && inverse[1] == 0 && inverse[2] == 0;
     tl_status status = find_window(g, error);
     return status == TL_OK ? make_grid(g, error) : status;
 }
@@ -174,140 +177,21 @@ tl_window scene_geodetic_window(const scene_geodetic *g)
     return g->window;
 }
 
-/* ---- Interpolation ---- */
-
-/* A part of the source. */
-typedef struct part {
-    tl_window window;
-    float *z;
-} part;
-
-/* Weights of Catmull and Rom's cubic for four samples, `f` from the second to the third. */
-static void cubic(double f, double w[4])
-{
-    w[0] = f * (-0.5 + f * (1 - 0.5 * f));
-    w[1] = 1 + f * f * (-2.5 + 1.5 * f);
-    w[2] = f * (0.5 + f * (2 - 1.5 * f));
-    w[3] = f * f * (-0.5 + 0.5 * f);
-}
-
-static int64_t clamp(int64_t value, int64_t size)
-{
-    return value < 0 ? 0 : value >= size ? size - 1 : value;
-}
-
-/* Sample (i, j) of a raster that may go around. */
-static float sample(const part *p, const tl_source_info *info, int64_t i, int64_t j)
-{
-    i = info->wraps ? i : clamp(i, info->width);
-    j = clamp(j, info->height);
-    return p->z[(j - p->window.y) * p->window.width + (i - p->window.x)];
-}
-
-static float bilinear(const part *p, const tl_source_info *info, int64_t i, int64_t j, double fx, double fy)
-{
-    double sum = 0, weights = 0;
-    for (int k = 0; k < 4; k++) {
-        float z = sample(p, info, i + (k & 1), j + (k >> 1));
-        double w = (k & 1 ? fx : 1 - fx) * (k >> 1 ? fy : 1 - fy);
-        if (isfinite(z)) {
-            sum += w * (double)z;
-            weights += w;
-        }
-    }
-    return weights >= 0.5 ? (float)(sum / weights) : NAN; /* void where most of it is */
-}
-
-static float interpolate(const part *p, const tl_source_info *info, double x, double y)
-{
-    int64_t i = (int64_t)floor(x), j = (int64_t)floor(y);
-    double fx = x - (double)i, fy = y - (double)j, wx[4], wy[4], sum = 0;
-    const tl_window *w = &p->window;
-    bool inside = i > w->x && j > w->y && i + 2 < w->x + w->width && j + 2 < w->y + w->height;
-    cubic(fx, wx);
-    cubic(fy, wy);
-    for (int row = 0; row < 4; row++) {
-        float rim[4];
-        const float *z = rim;
-        if (inside)
-            z = p->z + (j + row - 1 - w->y) * w->width + (i - 1 - w->x);
-        else
-            for (int column = 0; column < 4; column++)
-                rim[column] = sample(p, info, i + column - 1, j + row - 1);
-        sum += wy[row] * (wx[0] * (double)z[0] + wx[1] * (double)z[1] + wx[2] * (double)z[2] + wx[3] * (double)z[3]);
-    }
-    return isfinite(sum) ? (float)sum : bilinear(p, info, i, j, fx, fy);
-}
-
-/* Whether a position has a height at all. */
-static bool covered(const tl_source_info *info, double x, double y)
-{
-    /* the rim itself, for positions that round */
-    double margin = info->type == TL_RASTER_AREA ? 0.5 + 1e-9 : 1e-6;
-    bool along = info->wraps || (x >= -margin && x <= (double)info->width - 1 + margin);
-    return along && y >= -margin && y <= (double)info->height - 1 + margin;
-}
-
-/* The samples that positions ask for; false: none. */
-static bool find_part(const tl_source_info *info, const double *at, size_t n, tl_window *out)
-{
-    double low[2] = {HUGE_VAL, HUGE_VAL}, high[2] = {-HUGE_VAL, -HUGE_VAL};
-    for (size_t k = 0; k < n; k++)
-        if (covered(info, at[2 * k], at[2 * k + 1]))
-            for (int a = 0; a < 2; a++) {
-                low[a] = at[2 * k + (size_t)a] < low[a] ? at[2 * k + (size_t)a] : low[a];
-                high[a] = at[2 * k + (size_t)a] > high[a] ? at[2 * k + (size_t)a] : high[a];
-            }
-    if (!(low[0] <= high[0]))
-        return false;
-    int64_t x0 = (int64_t)floor(low[0]) - 1, x1 = (int64_t)floor(high[0]) + 2;
-    int64_t y0 = clamp((int64_t)floor(low[1]) - 1, info->height), y1 = clamp((int64_t)floor(high[1]) + 2, info->height);
-    if (!info->wraps) {
-        x0 = clamp(x0, info->width);
-        x1 = clamp(x1, info->width);
-    }
-    *out = (tl_window){x0, y0, x1 - x0 + 1, y1 - y0 + 1};
-    return true;
-}
-
-/* Columns x ... x + count - 1 of the raster into column `to` of the part. */
-static tl_status read_columns(const tl_source *source, part *p, int64_t x, int64_t count, int64_t to, tl_error *error)
-{
-    const tl_window *w = &p->window;
-    if (count == w->width)
-        return tl_source_read(source, source->info.level, (tl_window){x, w->y, count, w->height}, p->z, error);
-    float *columns = tl_alloc_grid(count, w->height, sizeof *columns);
-    if (!columns)
-        return tl_fail_memory(error, source->info.name);
-    tl_status status =
-        tl_source_read(source, source->info.level, (tl_window){x, w->y, count, w->height}, columns, error);
-    for (int64_t y = 0; y < w->height && status == TL_OK; y++)
-        memcpy(p->z + y * w->width + to, columns + y * count, (size_t)count * sizeof *columns);
-    free(columns);
-    return status;
-}
-
-/* Columns may be beyond a raster that goes around. */
-static tl_status read_part(const tl_source *source, part *p, tl_error *error)
-{
-    int64_t width = source->info.width;
-    tl_status status = TL_OK;
-    for (int64_t done = 0; done < p->window.width && status == TL_OK;) {
-        int64_t x = ((p->window.x + done) % width + width) % width;
-        int64_t count = tl_int64_min(p->window.width - done, width - x);
-        status = read_columns(source, p, x, count, done, error);
-        done += count;
-    }
-    return status;
-}
-
 /* ---- Reading ---- */
 
 typedef struct patch {
-    tl_window window; /* of vertices, at most PATCH on a side */
+    tl_window window; /* of vertices, at most PATCH or SCENE_PART_MOST on a side */
     float *out;       /* its first vertex */
     int64_t stride;
 } patch;
+
+/* Samples' positions of its vertices: of all, row by row; of its columns and rows where these are the samples', too. */
+typedef union places {
+    double all[2 * PATCH * PATCH];
+    struct {
+        double x[SCENE_PART_MOST], y[SCENE_PART_MOST];
+    } grid;
+} places;
 
 static tl_status read_patch(const scene_geodetic *g, const patch *of, tl_error *error);
 
@@ -329,68 +213,107 @@ static tl_status read_quarters(const scene_geodetic *g, const patch *of, tl_erro
     return status;
 }
 
-static void fill_patch(const scene_geodetic *g, const patch *of, const double *at, const part *p)
+static void fill_patch(const scene_geodetic *g, const patch *of, const places *at, const scene_part *p)
 {
     const tl_source_info *info = &g->source->info;
     const tl_window *w = &of->window;
-    for (int64_t y = 0; y < w->height; y++)
-        for (int64_t x = 0; x < w->width; x++) {
-            const double *here = at + 2 * (y * w->width + x);
-            float z = p && covered(info, here[0], here[1]) ? interpolate(p, info, here[0], here[1]) : NAN;
-            of->out[y * of->stride + x] = z * (float)info->georef.height_unit;
-        }
+    const float unit = (float)info->georef.height_unit;
+    if (p && g->upright)
+        scene_part_heights(p, info, w->width, at->grid.x, w->height, at->grid.y, of->out, of->stride);
+    for (int64_t y = 0; y < w->height; y++) {
+        float *row = of->out + y * of->stride;
+        const double *here = at->all + 2 * y * w->width;
+        for (int64_t x = 0; x < w->width && !(p && g->upright); x++)
+            row[x] = p ? scene_part_height(p, info, here[2 * x], here[2 * x + 1]) : NAN;
+        for (int64_t x = 0; x < w->width; x++)
+            row[x] *= unit;
+    }
 }
 
-static void find_patch(const scene_geodetic *g, const tl_window *w, double *at)
+/* Vertices in the turn in which the window counts, so that equal ones have equal positions; false: beyond what
+ * positions are known for, and in `out` the nearest that is not. */
+static bool known_column(const scene_geodetic *g, int64_t x, double *out)
+{
+    int64_t columns = scene_geodetic_columns(g->level), column = ((x - g->window.x) % columns + columns) % columns;
+    *out = (double)(g->window.x + scene_clamp(column, g->window.width));
+    return column < g->window.width;
+}
+
+static bool known_row(const scene_geodetic *g, int64_t y, double *out)
+{
+    *out = (double)(g->window.y + scene_clamp(y - g->window.y, g->window.height));
+    return y >= g->window.y && y < g->window.y + g->window.height;
+}
+
+static void find_all(const scene_geodetic *g, const tl_window *w, double *at)
 {
     double i[PATCH], j[PATCH];
-    int64_t columns = scene_geodetic_columns(g->level);
+    bool known[PATCH];
+    for (int64_t x = 0; x < w->width; x++)
+        known[x] = known_column(g, w->x + x, &i[x]);
     for (int64_t y = 0; y < w->height; y++) {
         double *row = at + 2 * y * w->width;
-        int64_t line = w->y + y - g->window.y;
-        for (int64_t x = 0; x < w->width; x++) {
-            /* the turn in which the window counts, so that equal vertices have equal positions */
-            int64_t column = ((w->x + x - g->window.x) % columns + columns) % columns;
-            i[x] = (double)(g->window.x + clamp(column, g->window.width));
-            j[x] = (double)(g->window.y + clamp(line, g->window.height));
-        }
+        bool inside = known_row(g, w->y + y, &j[0]);
+        for (int64_t x = 1; x < w->width; x++)
+            j[x] = j[0];
         find_positions(g, (size_t)w->width, i, j, row);
-        for (int64_t x = 0; x < w->width; x++) {
-            int64_t column = ((w->x + x - g->window.x) % columns + columns) % columns;
-            if (column >= g->window.width || line < 0 || line >= g->window.height)
-                row[2 * x] = row[2 * x + 1] = (double)NAN; /* beyond what positions are known for */
-        }
+        for (int64_t x = 0; x < w->width; x++)
+            if (!inside || !known[x])
+                row[2 * x] = row[2 * x + 1] = (double)NAN;
+    }
+}
+
+/* Of a lattice whose columns and rows are the samples'. */
+static void find_grid(const scene_geodetic *g, const tl_window *w, places *at)
+{
+    double i, j, position[2];
+    known_row(g, w->y, &j);
+    for (int64_t x = 0; x < w->width; x++) {
+        bool known = known_column(g, w->x + x, &i);
+        locate(g, 1, &i, &j, position);
+        at->grid.x[x] = known ? position[0] : (double)NAN;
+    }
+    known_column(g, w->x, &i);
+    for (int64_t y = 0; y < w->height; y++) {
+        bool known = known_row(g, w->y + y, &j);
+        locate(g, 1, &i, &j, position);
+        at->grid.y[y] = known ? position[1] : (double)NAN;
     }
 }
 
 static tl_status read_patch(const scene_geodetic *g, const patch *of, tl_error *error)
 {
-    double at[2 * PATCH * PATCH];
+    places at;
     const tl_source_info *info = &g->source->info;
     const tl_window *w = &of->window;
-    part p = {.z = NULL};
-    find_patch(g, w, at);
-    if (!find_part(info, at, (size_t)(w->width * w->height), &p.window)) {
-        fill_patch(g, of, at, NULL);
+    scene_part p = {.z = NULL};
+    if (g->upright)
+        find_grid(g, w, &at);
+    else
+        find_all(g, w, at.all);
+    if (!(g->upright ? scene_part_find_grid(info, w->width, at.grid.x, w->height, at.grid.y, &p.window)
+                     : scene_part_find(info, (size_t)(w->width * w->height), at.all, &p.window))) {
+        fill_patch(g, of, &at, NULL);
         return TL_OK;
     }
     if (p.window.width * p.window.height > MOST_SAMPLES && w->width * w->height > 1)
         return read_quarters(g, of, error);
     p.z = tl_alloc_grid(p.window.width, p.window.height, sizeof *p.z);
-    tl_status status = p.z ? read_part(g->source, &p, error) : tl_fail_memory(error, info->name);
+    tl_status status = p.z ? scene_part_read(g->source, &p, error) : tl_fail_memory(error, info->name);
     if (status == TL_OK)
-        fill_patch(g, of, at, &p);
+        fill_patch(g, of, &at, &p);
     free(p.z);
     return status;
 }
 
 tl_status scene_geodetic_read(const scene_geodetic *g, tl_window window, float *out, tl_error *error)
 {
+    const int64_t side = g->upright ? SCENE_PART_MOST : PATCH;
     tl_status status = TL_OK;
-    for (int64_t y = 0; y < window.height && status == TL_OK; y += PATCH)
-        for (int64_t x = 0; x < window.width && status == TL_OK; x += PATCH) {
-            patch here = {{window.x + x, window.y + y, tl_int64_min(PATCH, window.width - x),
-                           tl_int64_min(PATCH, window.height - y)},
+    for (int64_t y = 0; y < window.height && status == TL_OK; y += side)
+        for (int64_t x = 0; x < window.width && status == TL_OK; x += side) {
+            patch here = {{window.x + x, window.y + y, tl_int64_min(side, window.width - x),
+                           tl_int64_min(side, window.height - y)},
                           out + y * window.width + x,
                           window.width};
             status = read_patch(g, &here, error);
@@ -413,7 +336,7 @@ typedef struct comparison {
  */
 static double surface(const comparison *c, double u, double v)
 {
-    int64_t i = clamp((int64_t)u, c->cells), j = clamp((int64_t)v, c->cells);
+    int64_t i = scene_clamp((int64_t)u, c->cells), j = scene_clamp((int64_t)v, c->cells);
     double fu = u - (double)i, fv = v - (double)j;
     const float *z = c->z + j * c->stride + i;
     double sw = (double)z[0], se = (double)z[1], nw = (double)z[c->stride], ne = (double)z[c->stride + 1];
@@ -461,7 +384,7 @@ static bool find_samples(const comparison *c, tl_window *out)
         if (k % 2 || !g->source->info.wraps)
             at[k] = fmin(fmax(at[k], 0), (double)(size - 1));
     }
-    return find_part(&g->source->info, at, SIDE * SIDE, out);
+    return scene_part_find(&g->source->info, SIDE * SIDE, at, out);
 }
 
 /* Places of a row's samples, in degrees. */
@@ -490,11 +413,11 @@ tl_status scene_geodetic_compare(const scene_geodetic *g, int64_t x, int64_t y, 
     w.width = tl_int64_min(w.width, info->width);
     double *longitude = tl_alloc((size_t)w.width, sizeof *longitude);
     double *latitude = tl_alloc((size_t)w.width, sizeof *latitude);
-    part row = {.z = tl_alloc((size_t)w.width, sizeof *row.z)};
+    scene_part row = {.z = tl_alloc((size_t)w.width, sizeof *row.z)};
     tl_status status = longitude && latitude && row.z ? TL_OK : tl_fail_memory(error, info->name);
     for (int64_t line = 0; line < w.height && status == TL_OK; line++) {
         row.window = (tl_window){w.x, w.y + line, w.width, 1};
-        status = read_part(g->source, &row, error);
+        status = scene_part_read(g->source, &row, error);
         if (status == TL_OK)
             status = find_degrees(g, row.window, longitude, latitude, error);
         if (status == TL_OK)

@@ -72,9 +72,24 @@ static void raise_parents(float *lost, int s, bool centres)
     for (int y = centres ? s : 0; y < ROW; y += centres ? 2 * s : s)
         for (int x = centres || (y / s) % 2 == 0 ? s : 0; x < ROW; x += 2 * s) {
             int64_t parents[2][2];
+            if (!(lost[y * ROW + x] > 0))
+                continue; /* as all over ground that is not known */
             tl_lattice_parents(x, y, parents);
             raise_to(lost, (const int64_t(*)[2])parents, lost[y * ROW + x]);
         }
+}
+
+/* Of the four cells around each vertex of a row. */
+static void gather_row(const scene_block *block, int y, float *restrict out)
+{
+    const float *above = block->lost + y * SIDE, *below = above - SIDE;
+    out[0] = greater(lost_at(block, 0, y - 1), lost_at(block, 0, y));
+    for (int x = 1; x < SIDE; x++) {
+        float lower = y > 0 ? greater(below[x - 1], below[x]) : 0,
+              upper = y < SIDE ? greater(above[x - 1], above[x]) : 0;
+        out[x] = greater(lower, upper);
+    }
+    out[SIDE] = greater(lost_at(block, SIDE - 1, y - 1), lost_at(block, SIDE - 1, y));
 }
 
 /* What the cells under each vertex and all that depend on it have lost, into `out`: those of the smallest triangles lie
@@ -82,9 +97,7 @@ static void raise_parents(float *lost, int s, bool centres)
 static void gather_lost(const scene_block *block, float *out)
 {
     for (int y = 0; y < ROW; y++)
-        for (int x = 0; x < ROW; x++)
-            out[y * ROW + x] = greater(greater(lost_at(block, x - 1, y - 1), lost_at(block, x, y - 1)),
-                                       greater(lost_at(block, x - 1, y), lost_at(block, x, y)));
+        gather_row(block, y, out + y * ROW);
     for (int s = 1; s < SCENE_RIM; s *= 2) {
         raise_parents(out, s, false);
         raise_parents(out, s, true);
