@@ -50,6 +50,7 @@ static const ground grounds[] = {
     {"a map across the antimeridian", "EPSG:32601", {337000, 300, 0, 7200000, 0, -300}, 150, 150, 1, 20, 1, 0, 1, 6},
     {"the globe", "EPSG:4326", {-179.5, 1, 0, 89.5, 0, -1}, 360, 180, 0, 40, 20, 0, 1, 500},
     {"the globe by points", "EPSG:4326", {0, 1, 0, 90, 0, -1}, 360, 181, 1, 40, 20, 0, 1, 500},
+    {"the globe in an odd width", "EPSG:4326", {-180, 0.96, 0, 89.52, 0, -0.96}, 375, 187, 0, 40, 20, 0, 1, 200},
     {"around the South Pole", "EPSG:3031", {-256000, 4000, 0, 256000, 0, -4000}, 129, 129, 1, 20, 1, 0, 1, 20},
     {"holes", "EPSG:4326", {7, 0.001, 0, 46, 0, -0.001}, 300, 200, 0, 25, 2, 1, 1, 5},
     {"a third of it void", "EPSG:4326", {7, 0.001, 0, 46, 0, -0.001}, 150, 140, 1, 25, 2, 2, 1, 5},
@@ -816,6 +817,81 @@ static void neighboursShareTheirEdgesAndNormals(void **state)
     assert_true(pairs > 100 && shared > 2 * pairs); /* each has the two ends of an edge, twice */
 }
 
+/* The column at which a raster goes around, as a tile has it: heights of the ground by row, and of the ends of skirts.
+ */
+typedef struct rim {
+    double row[1024], z[1024];
+    size_t count;
+} rim;
+
+static void add_to_rim(rim *r, double row, double z)
+{
+    size_t at = r->count++;
+    assert_true(r->count < 1024);
+    for (; at > 0 && r->row[at - 1] > row; at--)
+        r->row[at] = r->row[at - 1], r->z[at] = r->z[at - 1];
+    r->row[at] = row, r->z[at] = z;
+}
+
+static void find_rims(const content *c, double column, rim *land, rim *ends)
+{
+    *land = *ends = (rim){.count = 0};
+    for (size_t k = 0; k < c->vertices; k++)
+        if (fabs(c->sample[k][0] - column) <= 0.02 && fabs(c->place[k][1]) < 1.56) /* not at a pole */
+            add_to_rim(c->ground[k] ? land : ends, c->sample[k][1], c->place[k][2]);
+}
+
+static double height_on(const rim *r, double row)
+{
+    size_t k = 1;
+    while (k + 1 < r->count && r->row[k] < row)
+        k++;
+    double f = fmin(fmax((row - r->row[k - 1]) / (r->row[k] - r->row[k - 1]), 0), 1);
+    return r->z[k - 1] + f * (r->z[k] - r->z[k - 1]);
+}
+
+/* Whether skirts under one side's rim reach down to the other's ground, everywhere along it. */
+static void expect_covered(const rim *land, const rim *ends, const rim *other, double quantum, const char *name)
+{
+    assert_true(land->count > 1 && ends->count == land->count && other->count > 1);
+    for (size_t k = 0; k < ends->count; k++) {
+        assert_true(fabs(ends->row[k] - land->row[k]) < 0.04 && ends->z[k] < land->z[k]);
+        double there = height_on(other, ends->row[k]);
+        if (ends->z[k] > there + 2 * quantum)
+            fail_msg("%s: at row %g a skirt ends at %g m, over the other side's %g", name, ends->row[k], ends->z[k],
+                     there);
+    }
+}
+
+static void skirtsCloseTheSeamOfTheGlobe(void **state)
+{
+    (void)state;
+    size_t pairs = 0;
+    for (int g = 0; g < GROUNDS; g++) {
+        const struct pyramid *p = pyramid_of(g);
+        for (size_t k = 0; k < p->tree.count && p->source->info.wraps; k++) {
+            const node *n = &p->tree.nodes[k], *m;
+            int64_t cells = (int64_t)64 << (p->report.last_level - n->level);
+            m = find_node(&p->tree, n->level, (grounds[g].width - 1) / cells, n->y);
+            if (n->x || !n->content || !m || !m->content)
+                continue;
+            content west, east;
+            rim grounds_of[2], ends_of[2];
+            open_content(&west, p->where, n, &p->locator, 0);
+            open_content(&east, p->where, m, &p->locator, grounds[g].width);
+            find_rims(&west, 0, &grounds_of[0], &ends_of[0]);
+            find_rims(&east, grounds[g].width, &grounds_of[1], &ends_of[1]);
+            double quantum = fmax(west.quantum, east.quantum);
+            expect_covered(&grounds_of[0], &ends_of[0], &grounds_of[1], quantum, grounds[g].name);
+            expect_covered(&grounds_of[1], &ends_of[1], &grounds_of[0], quantum, grounds[g].name);
+            close_content(&west);
+            close_content(&east);
+            pairs++;
+        }
+    }
+    assert_true(pairs >= 15); /* of three globes */
+}
+
 /* ---- The same bytes ---- */
 
 static int numbered(const char *name)
@@ -1030,6 +1106,7 @@ int main(void)
         cmocka_unit_test(acrossTheAntimeridianTheEastIsLessThanTheWest),
         cmocka_unit_test(everySampleIsWithinTheErrorOfItsTiles),
         cmocka_unit_test(neighboursShareTheirEdgesAndNormals),
+        cmocka_unit_test(skirtsCloseTheSeamOfTheGlobe),
         cmocka_unit_test(threadsAndShardsDoNotChangeAByte),
         cmocka_unit_test(resumingMendsWhatIsMissingOrBroken),
         cmocka_unit_test(compressedPositionsAreTheSame),

@@ -290,13 +290,17 @@ static tl_status place_ground(out_surface *s, const out_glb_tile *t, tl_error *e
 
 /* ---- Skirts ---- */
 
-/* Whether the edge lies on a side of the tile behind which there is a neighbour. */
-static bool is_border(const out_glb_tile *t, const tl_window *all, const out_surface_vertex *a,
+/* Whether the edge lies on a side of the tile behind which there is a neighbour. Where columns go around, that is so at
+ * the first and the last, too: of coarse lattices, the last may lie between vertices, and its heights be others. */
+static bool is_border(const out_surface *s, const out_glb_tile *t, const out_surface_vertex *a,
                       const out_surface_vertex *b)
 {
+    const tl_window all = scene_own_lattice_window(s->lattice);
     double side = (double)t->step * t->drawn->mesh->cells;
     const double first[2] = {(double)t->x, (double)t->y};
-    const double last[2] = {(double)(all->width - 1), (double)(all->height - 1)};
+    const double last[2] = {(double)(all.width - 1), (double)(all.height - 1)};
+    if (scene_own_lattice_goes_around(s->lattice) && a->x == b->x && (a->x == 0 || a->x == last[0]))
+        return true;
     for (int axis = 0; axis < 2; axis++) {
         double p = axis ? a->y : a->x, q = axis ? b->y : b->x;
         if (p == q && ((p == first[axis] && p > 0) || (p == first[axis] + side && p < last[axis])))
@@ -319,7 +323,6 @@ static uint32_t lower_vertex(out_surface *s, uint32_t above, double depth, uint3
 
 static tl_status add_skirts(out_surface *s, const out_glb_tile *t, tl_error *error)
 {
-    const tl_window all = scene_own_lattice_window(s->lattice);
     uint32_t *lower = tl_alloc(s->vertex_count, sizeof *lower);
     s->ground_count = s->index_count;
     if (!lower)
@@ -327,7 +330,7 @@ static tl_status add_skirts(out_surface *s, const out_glb_tile *t, tl_error *err
     memset(lower, 0xff, s->vertex_count * sizeof *lower);
     for (size_t k = 0; k < s->ground_count && t->skirt > 0; k++) {
         uint32_t a = s->indices[k], b = s->indices[k % 3 == 2 ? k - 2 : k + 1];
-        if (!is_border(t, &all, &s->vertices[a], &s->vertices[b]))
+        if (!is_border(s, t, &s->vertices[a], &s->vertices[b]))
             continue;
         uint32_t c = lower_vertex(s, a, t->skirt, lower), d = lower_vertex(s, b, t->skirt, lower);
         const uint32_t wall[6] = {c, d, b, c, b, a}; /* seen from outside */

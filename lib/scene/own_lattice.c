@@ -170,6 +170,11 @@ tl_window scene_own_lattice_window(const scene_own_lattice *g)
     return (tl_window){0, 0, g->width, g->height};
 }
 
+bool scene_own_lattice_goes_around(const scene_own_lattice *g)
+{
+    return g->source->info.wraps;
+}
+
 bool scene_own_lattice_is_geographic(const scene_own_lattice *g)
 {
     const double *t = g->source->info.georef.transform;

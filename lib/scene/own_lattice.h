@@ -16,6 +16,8 @@ void scene_own_lattice_destroy(scene_own_lattice *lattice);
 
 /* All vertices: from (0, 0) on. */
 tl_window scene_own_lattice_window(const scene_own_lattice *lattice);
+/* Whether the last column is the first once more. */
+bool scene_own_lattice_goes_around(const scene_own_lattice *lattice);
 /* Whether columns are meridians and rows parallels. */
 bool scene_own_lattice_is_geographic(const scene_own_lattice *lattice);
 /* Heights in metres, row by row upwards; NaN where there are none, as outside. Any thread. */
