@@ -11,11 +11,6 @@
 
 enum { WORKER_BYTES = 80 << 20 /* 65 MB are measured */ };
 
-typedef struct round_of_work {
-    out_pyramid *p;
-    out_block_worker **workers;
-} round_of_work;
-
 /* The bound of a level. A tile has no more than 256 cells on a side: at the top, what the Earth's curve takes of them
  * is more than small bounds allow. */
 double out_pyramid_bound(const out_pyramid *p, int level)
@@ -50,8 +45,7 @@ int out_compare_blocks(const void *a, const void *b)
 static tl_status do_block(void *context, tl_parallel *loop, uint64_t item, unsigned index, tl_error *error)
 {
     (void)loop;
-    const round_of_work *r = context;
-    out_pyramid *p = r->p;
+    out_pyramid *p = context;
     const out_block_place *at = &p->blocks[item];
     out_piece *piece = &p->pieces[item];
     bool found = false;
@@ -65,12 +59,12 @@ static tl_status do_block(void *context, tl_parallel *loop, uint64_t item, unsig
     if (status == TL_OK && p->options->finish && p->level == p->deepest)
         return tl_fail(error, TL_ERROR_ARGUMENT, "%s: block %lld, %lld is not done; run the shards first", p->folder,
                        (long long)at->column, (long long)at->row);
-    if (status == TL_OK && !r->workers[index]) {
-        r->workers[index] = out_block_worker_create(p, error);
-        status = r->workers[index] ? TL_OK : TL_ERROR_MEMORY;
+    if (status == TL_OK && !p->workers[index]) {
+        p->workers[index] = out_block_worker_create(p, error);
+        status = p->workers[index] ? TL_OK : TL_ERROR_MEMORY;
     }
     if (status == TL_OK)
-        status = out_block_make(p, r->workers[index], at, piece, error);
+        status = out_block_make(p, p->workers[index], at, piece, error);
     free(piece->z);
     free(piece->lost);
     piece->z = piece->lost = NULL;
@@ -128,19 +122,27 @@ static tl_run run_of(const out_pyramid *p)
     return run;
 }
 
+static void free_workers(out_pyramid *p)
+{
+    for (unsigned k = 0; k < p->worker_count; k++)
+        out_block_worker_destroy(p, p->workers[k]);
+    free(p->workers);
+    p->workers = NULL;
+    p->worker_count = 0;
+}
+
 static tl_status do_lattice(out_pyramid *p, tl_error *error)
 {
     const tl_run run = run_of(p);
-    unsigned count = tl_parallel_workers(&run, p->block_count);
-    round_of_work r = {p, calloc(count, sizeof *r.workers)};
+    if (!p->workers && (p->workers = calloc(tl_parallel_workers(&run, UINT64_MAX >> 1), sizeof *p->workers)))
+        p->worker_count = tl_parallel_workers(&run, UINT64_MAX >> 1);
     p->pieces = calloc(p->block_count, sizeof *p->pieces);
-    tl_status status = r.workers && p->pieces ? TL_OK : tl_fail_memory(error, p->folder);
+    tl_status status = p->workers && p->pieces ? TL_OK : tl_fail_memory(error, p->folder);
     p->report.blocks += p->block_count;
     if (status == TL_OK && p->block_count)
-        status = tl_parallel_for(&run, p->block_count, p->block_count * SCENE_BLOCK * SCENE_BLOCK, do_block, &r, error);
-    for (unsigned k = 0; r.workers && k < count; k++)
-        out_block_worker_destroy(p, r.workers[k]);
-    free(r.workers);
+        status = tl_parallel_for(&run, p->block_count, p->block_count * SCENE_BLOCK * SCENE_BLOCK, do_block, p, error);
+    if (p->level == p->deepest) /* the others have room for what is lost, too */
+        free_workers(p);
     if (status == TL_OK)
         status = take_pieces(p, error);
     for (size_t b = 0; status != TL_OK && p->pieces && b < p->block_count; b++)
@@ -299,6 +301,7 @@ tl_status out_pyramid_make(out_pyramid *p, tl_error *error)
 
 void out_pyramid_finish(out_pyramid *p)
 {
+    free_workers(p);
     out_tile_list_finish(&p->list);
     free(p->tiles);
     free(p->blocks);

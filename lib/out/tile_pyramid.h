@@ -44,7 +44,9 @@ typedef struct out_pyramid {
     size_t block_count;
     out_block_place *finer; /* those of the lattice before */
     size_t finer_count;
-    out_piece *pieces; /* of these blocks, without samples */
+    out_piece *pieces;                 /* of these blocks, without samples */
+    struct out_block_worker **workers; /* kept from one lattice above the deepest to the next */
+    unsigned worker_count;
 } out_pyramid;
 
 /* A tile that is drawn, to become a file. */

@@ -15,8 +15,9 @@ tl_status scene_block_init(scene_block *block, bool lost, tl_error *error)
 {
     *block = (scene_block){.z = tl_alloc_grid(ROW, ROW, sizeof *block->z),
                            .lost = lost ? tl_alloc_grid(SIDE, SIDE, sizeof *block->lost) : NULL,
-                           .errors = tl_alloc_grid(ROW, ROW, sizeof *block->errors)};
-    if (block->z && block->errors && (!lost || block->lost))
+                           .errors = tl_alloc_grid(ROW, ROW, sizeof *block->errors),
+                           .rising = lost ? tl_alloc_grid(ROW, ROW, sizeof *block->rising) : NULL};
+    if (block->z && block->errors && (!lost || (block->lost && block->rising)))
         return TL_OK;
     scene_block_finish(block);
     return tl_fail_memory(error, "a block of tiles");
@@ -27,6 +28,7 @@ void scene_block_finish(scene_block *block)
     free(block->z);
     free(block->lost);
     free(block->errors);
+    free(block->rising);
     *block = (scene_block){0};
 }
 
@@ -41,8 +43,11 @@ static tl_status measure_samples(scene_block *block, tl_error *error)
     const tl_pyramid_options options = {.exact = true, .frame = TL_FRAME_PIXEL, .run = &run};
     tl_source *source = tl_array_source_create(block->z, &info, error);
     tl_pyramid *pyramid = source ? tl_pyramid_create(source, &options, error) : NULL;
-    if (pyramid)
-        memcpy(block->errors, pyramid->errors, (size_t)ROW * ROW * sizeof *block->errors);
+    if (pyramid) { /* which are of the same size */
+        float *swapped = block->errors;
+        block->errors = pyramid->errors;
+        pyramid->errors = swapped;
+    }
     tl_pyramid_destroy(pyramid);
     tl_source_destroy(source);
     return pyramid ? TL_OK : TL_ERROR_MEMORY;
@@ -109,13 +114,9 @@ tl_status scene_block_measure(scene_block *block, tl_error *error)
     tl_status status = measure_samples(block, error);
     if (status != TL_OK || !block->lost)
         return status;
-    float *lost = tl_alloc_grid(ROW, ROW, sizeof *lost);
-    if (!lost)
-        return tl_fail_memory(error, "a block of tiles");
-    gather_lost(block, lost);
+    gather_lost(block, block->rising);
     for (size_t k = 0; k < (size_t)ROW * ROW; k++)
-        block->errors[k] += lost[k];
-    free(lost);
+        block->errors[k] += block->rising[k];
     return TL_OK;
 }
 

@@ -26,6 +26,7 @@ typedef struct scene_block {
     float *z;      /* SCENE_BLOCK_VERTICES^2 heights from the south-western corner of the rim; NaN: void */
     float *lost;   /* SCENE_BLOCK_SIDE^2, a cell each: how far finer lattices are from it; NULL: nothing is lost */
     float *errors; /* by vertex, filled in by scene_block_measure */
+    float *rising; /* room for it, where something is lost */
 } scene_block;
 
 /* Room for the heights, and for what is lost if asked for. */
