@@ -4,11 +4,13 @@
 #include "lib/scene/cell_store.h"
 #include "lib/talus.h"
 
+#include <pthread.h>
 #include <setjmp.h>
 #include <stdarg.h>
 #include <stdatomic.h>
 #include <stdlib.h>
 #include <string.h>
+#include <time.h>
 
 #include <cmocka.h>
 
@@ -104,12 +106,86 @@ static void whatFailedIsNotKept(void **state)
     scene_cell_store_destroy(NULL);
 }
 
+/* Threads that all want what one of them is making, which takes a while. */
+typedef struct crowd {
+    scene_cell_store *store;
+    atomic_int calls, made, right;
+    int fails; /* so many calls */
+} crowd;
+
+static tl_status make_slowly(const void *context, fbm_window w, double *out, tl_error *error)
+{
+    crowd *of = *(crowd *const *)context;
+    const int call = atomic_fetch_add(&of->calls, 1);
+    nanosleep(&(struct timespec){.tv_nsec = 20000000}, NULL);
+    if (call < of->fails)
+        return tl_fail(error, TL_ERROR_IO, "no cells");
+    for (size_t k = 0; k < w.width * w.height; k++)
+        out[k] = number_of(w.i + (int64_t)(k % w.width), w.j + (int64_t)(k / w.width));
+    atomic_fetch_add(&of->made, (int)(w.width * w.height));
+    return TL_OK;
+}
+
+/* Windows of 64 x 64, each 16 cells right of the one before. */
+static void *read_slowly(void *context, int64_t number)
+{
+    crowd *of = context;
+    const fbm_window w = {16 * number, 0, 64, 64, 64};
+    double *out = malloc(w.width * w.height * sizeof *out);
+    bool good = out && scene_cell_store_read(of->store, w, make_slowly, &of, out, "cells", NULL) == TL_OK;
+    for (size_t k = 0; good && k < w.width * w.height; k++)
+        good = out[k] == number_of(w.i + (int64_t)(k % w.width), w.j + (int64_t)(k / w.width));
+    atomic_fetch_add(&of->right, good);
+    free(out);
+    return NULL;
+}
+
+static void *read_first(void *context)
+{
+    return read_slowly(context, 0);
+}
+
+static void *read_second(void *context)
+{
+    return read_slowly(context, 1);
+}
+
+static void read_at_once(crowd *of)
+{
+    pthread_t threads[4];
+    for (int k = 0; k < 4; k++)
+        assert_int_equal(pthread_create(&threads[k], NULL, k % 2 ? read_second : read_first, of), 0);
+    for (int k = 0; k < 4; k++)
+        assert_int_equal(pthread_join(threads[k], NULL), 0);
+}
+
+static void whatOneMakesOthersWaitFor(void **state)
+{
+    (void)state;
+    crowd of = {.store = scene_cell_store_create(1000)};
+    assert_non_null(of.store);
+    read_at_once(&of);
+    assert_int_equal(of.right, 4);
+    assert_int_equal(of.made, (64 + 16) * 64); /* the same in any order: what lacks is a rectangle */
+    scene_cell_store_destroy(of.store);
+}
+
+static void whatOneFailsToMakeOthersMake(void **state)
+{
+    (void)state;
+    crowd of = {.store = scene_cell_store_create(1000), .fails = 2};
+    assert_non_null(of.store);
+    read_at_once(&of);
+    assert_int_equal(of.right, 2); /* a call that fails is the end of one read */
+    scene_cell_store_destroy(of.store);
+}
+
 int main(void)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(windowsOfManyThreadsAreRight),
-        cmocka_unit_test(whatWasReadIsNotMadeAgain),
-        cmocka_unit_test(whatFailedIsNotKept),
+        cmocka_unit_test(windowsOfManyThreadsAreRight), cmocka_unit_test(whatWasReadIsNotMadeAgain),
+        cmocka_unit_test(whatFailedIsNotKept),          cmocka_unit_test(whatOneMakesOthersWaitFor),
+        cmocka_unit_test(whatOneFailsToMakeOthersMake),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }

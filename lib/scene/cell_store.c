@@ -17,8 +17,16 @@ typedef struct block {
     double cells[CELLS];
 } block;
 
+/* Blocks that a thread is making: those in a rectangle of them. It lies on the maker's stack. */
+typedef struct claim {
+    int64_t left, top, right, below;
+    struct claim *next;
+} claim;
+
 struct scene_cell_store {
-    pthread_mutex_t lock;  /* over the blocks */
+    pthread_mutex_t lock;   /* over the blocks and the claims */
+    pthread_cond_t changed; /* a claim has gone */
+    claim *claims;
     int64_t columns, rows; /* powers of 2: block (i, j) is kept at their remainders */
     block **blocks;        /* NULL: none yet */
 };
@@ -34,6 +42,7 @@ scene_cell_store *scene_cell_store_create(int64_t width)
         return NULL;
     }
     pthread_mutex_init(&store->lock, NULL);
+    pthread_cond_init(&store->changed, NULL);
     store->columns = 16;
     while (store->columns < BLOCKS / LEAST_ROWS && store->columns * SIDE < width)
         store->columns *= 2;
@@ -46,6 +55,7 @@ void scene_cell_store_destroy(scene_cell_store *store)
     if (!store)
         return;
     pthread_mutex_destroy(&store->lock);
+    pthread_cond_destroy(&store->changed);
     for (size_t k = 0; k < BLOCKS; k++)
         free(store->blocks[k]);
     free(store->blocks);
@@ -79,37 +89,67 @@ static void copy_block(const double *from, size_t from_stride, double *to, size_
         memcpy(to + row * to_stride, from + row * from_stride, SIDE * sizeof *to);
 }
 
-/* Takes what is there; the window around what is not, of no width where all is. */
-static fbm_window take(scene_cell_store *store, fbm_window w, double *out)
+/* A rectangle of blocks, none where left >= right. */
+typedef claim blocks;
+
+static const blocks no_blocks = {INT64_MAX, INT64_MAX, INT64_MIN, INT64_MIN, NULL};
+
+static void include(blocks *of, int64_t i, int64_t j)
 {
-    int64_t left = INT64_MAX, top = INT64_MAX, right = INT64_MIN, below = INT64_MIN;
-    const int64_t i0 = w.i / SIDE, j0 = w.j / SIDE, i1 = i0 + (int64_t)w.width / SIDE,
-                  j1 = j0 + (int64_t)w.height / SIDE;
-    pthread_mutex_lock(&store->lock);
-    for (int64_t j = j0; j < j1; j++)
-        for (int64_t i = i0; i < i1; i++) {
-            const block *b = *block_of(store, i, j);
-            if (b && b->i == i && b->j == j) {
-                copy_block(b->cells, SIDE, cells_in(w, out, i, j), w.width);
-                continue;
-            }
-            left = tl_int64_min(left, i);
-            top = tl_int64_min(top, j);
-            right = tl_int64_max(right, i + 1);
-            below = tl_int64_max(below, j + 1);
-        }
-    pthread_mutex_unlock(&store->lock);
-    if (left > right)
-        return (fbm_window){.width = 0};
-    size_t width = (size_t)(right - left) * SIDE;
-    return (fbm_window){left * SIDE, top * SIDE, width, (size_t)(below - top) * SIDE, width};
+    of->left = tl_int64_min(of->left, i);
+    of->top = tl_int64_min(of->top, j);
+    of->right = tl_int64_max(of->right, i + 1);
+    of->below = tl_int64_max(of->below, j + 1);
 }
 
-/* Hands out what was made, and keeps it where there is memory for it. */
+static bool lies_in(const blocks *of, int64_t i, int64_t j)
+{
+    return i >= of->left && i < of->right && j >= of->top && j < of->below;
+}
+
+static bool covers(const blocks *of, const blocks *others)
+{
+    return of->left <= others->left && of->top <= others->top && of->right >= others->right &&
+           of->below >= others->below;
+}
+
+static bool is_claimed(const scene_cell_store *store, int64_t i, int64_t j)
+{
+    for (const claim *c = store->claims; c; c = c->next)
+        if (lies_in(c, i, j))
+            return true;
+    return false;
+}
+
+static void give_up(scene_cell_store *store, const claim *mine)
+{
+    claim **at = &store->claims;
+    while (*at != mine)
+        at = &(*at)->next;
+    *at = mine->next;
+    pthread_cond_broadcast(&store->changed);
+}
+
+/* Takes what is there of the blocks `of` of a window. What is not and nobody makes is to be made: the blocks around it;
+ * true: there are none such, but some that another thread makes, `others` around these. Under the lock. */
+static bool take(const scene_cell_store *store, fbm_window w, blocks of, double *out, blocks *missing, blocks *others)
+{
+    *missing = *others = no_blocks;
+    for (int64_t j = of.top; j < of.below; j++)
+        for (int64_t i = of.left; i < of.right; i++) {
+            const block *b = *block_of(store, i, j);
+            if (b && b->i == i && b->j == j)
+                copy_block(b->cells, SIDE, cells_in(w, out, i, j), w.width);
+            else
+                include(is_claimed(store, i, j) ? others : missing, i, j);
+        }
+    return missing->left >= missing->right && others->left < others->right;
+}
+
+/* Hands out what was made, and keeps it where there is memory for it. Under the lock. */
 static void keep(scene_cell_store *store, fbm_window made, double *numbers, fbm_window w, double *out)
 {
     const int64_t i0 = made.i / SIDE, j0 = made.j / SIDE;
-    pthread_mutex_lock(&store->lock);
     for (int64_t j = j0; j < j0 + (int64_t)made.height / SIDE; j++)
         for (int64_t i = i0; i < i0 + (int64_t)made.width / SIDE; i++) {
             const double *from = cells_in(made, numbers, i, j);
@@ -123,22 +163,50 @@ static void keep(scene_cell_store *store, fbm_window made, double *numbers, fbm_
             (*b)->j = j;
             copy_block(from, made.width, (*b)->cells, SIDE);
         }
-    pthread_mutex_unlock(&store->lock);
 }
 
+/* Makes blocks that this thread has claimed. */
+static tl_status make_blocks(scene_cell_store *store, const blocks *of, scene_cell_store_make make, const void *context,
+                             fbm_window w, double *out, const char *name, tl_error *error)
+{
+    fbm_window made = {of->left * SIDE, of->top * SIDE, (size_t)(of->right - of->left) * SIDE,
+                       (size_t)(of->below - of->top) * SIDE, (size_t)(of->right - of->left) * SIDE};
+    double *numbers = tl_alloc_grid((int64_t)made.width, (int64_t)made.height, sizeof *numbers);
+    tl_status status = numbers ? make(context, made, numbers, error) : tl_fail_memory(error, name);
+    pthread_mutex_lock(&store->lock);
+    if (status == TL_OK)
+        keep(store, made, numbers, w, out);
+    give_up(store, of);
+    pthread_mutex_unlock(&store->lock);
+    free(numbers);
+    return status;
+}
+
+/* Who waits for another thread's blocks has made his own and claims none, so that nobody waits for him; what the other
+ * failed to make, or what has lost its place since, he then makes himself. */
 tl_status scene_cell_store_read(scene_cell_store *store, fbm_window w, scene_cell_store_make make, const void *context,
                                 double *out, const char *name, tl_error *error)
 {
     assert(w.i % SIDE == 0 && w.j % SIDE == 0 && w.width % SIDE == 0 && w.height % SIDE == 0);
-    fbm_window missing = take(store, w, out);
-    if (missing.width == 0)
-        return TL_OK;
-    double *numbers = tl_alloc_grid((int64_t)missing.width, (int64_t)missing.height, sizeof *numbers);
-    if (!numbers)
-        return tl_fail_memory(error, name);
-    tl_status status = make(context, missing, numbers, error);
-    if (status == TL_OK)
-        keep(store, missing, numbers, w, out);
-    free(numbers);
-    return status;
+    blocks wanted = {w.i / SIDE, w.j / SIDE, w.i / SIDE + (int64_t)w.width / SIDE,
+                     w.j / SIDE + (int64_t)w.height / SIDE, NULL};
+    while (wanted.left < wanted.right) {
+        blocks missing, others;
+        pthread_mutex_lock(&store->lock);
+        while (take(store, w, wanted, out, &missing, &others)) {
+            wanted = others;
+            pthread_cond_wait(&store->changed, &store->lock);
+        }
+        const bool any = missing.left < missing.right;
+        if (any) {
+            missing.next = store->claims;
+            store->claims = &missing;
+        }
+        pthread_mutex_unlock(&store->lock);
+        tl_status status = any ? make_blocks(store, &missing, make, context, w, out, name, error) : TL_OK;
+        if (status != TL_OK)
+            return status;
+        wanted = any && covers(&missing, &others) ? no_blocks : others;
+    }
+    return TL_OK;
 }

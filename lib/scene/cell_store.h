@@ -17,7 +17,8 @@ void scene_cell_store_destroy(scene_cell_store *store);
 /* The least window around `window` that a store keeps: of whole blocks. */
 fbm_window scene_cell_store_window(fbm_window window);
 /* The numbers of such a window, row by row without gaps: kept ones, and where some are not, those that `make` makes of
- * the least window around these. Any number of threads may ask at once. */
+ * the least window around these. Any number of threads may ask at once: what one is making, others wait for. So `make`
+ * must not ask the store that it makes for, nor one whose `make` does. */
 tl_status scene_cell_store_read(scene_cell_store *store, fbm_window window, scene_cell_store_make make,
                                 const void *context, double *out, const char *name, tl_error *error);
 
