@@ -581,7 +581,7 @@ static void pit_row(halves above, halves upper, halves lower, halves below, size
 static void soften_row(const float *restrict pits, const float *restrict z, size_t count, halves upper, halves lower)
 {
     float *restrict a = upper.of[0], *restrict b = upper.of[1], *restrict c = lower.of[0], *restrict d = lower.of[1];
-    for (size_t k = 0; k < count; k++) {
+    for (size_t k = 0; k < whole_vectors(count); k++) {
         float soften = pits[k], height = z[k];
         a[k] += soften * (height - a[k]);
         b[k] += soften * (height - b[k]);
@@ -802,13 +802,17 @@ static const float gauss[SMOOTHING + 1] = {1,          .8824969F,   .60653066F, 
 
 static void smooth_across(const float *in, ptrdiff_t stride, size_t count, float *restrict out)
 {
-    for (size_t k = 0; k < count; k++)
-        out[k] = in[k] + gauss[1] * (in[(ptrdiff_t)k - stride] + in[(ptrdiff_t)k + stride]);
-    for (int t = 2; t <= SMOOTHING; t++) {
-        const float *before = in - t * stride, *after = in + t * stride;
-        const float weight = gauss[t];
-        for (size_t k = 0; k < count; k++)
-            out[k] += weight * (before[k] + after[k]);
+    for (ptrdiff_t k = 0; k < (ptrdiff_t)count; k++) {
+        const float *at = in + k;
+        float sum = at[0] + gauss[1] * (at[-stride] + at[stride]);
+        sum += gauss[2] * (at[-2 * stride] + at[2 * stride]);
+        sum += gauss[3] * (at[-3 * stride] + at[3 * stride]);
+        sum += gauss[4] * (at[-4 * stride] + at[4 * stride]);
+        sum += gauss[5] * (at[-5 * stride] + at[5 * stride]);
+        sum += gauss[6] * (at[-6 * stride] + at[6 * stride]);
+        sum += gauss[7] * (at[-7 * stride] + at[7 * stride]);
+        sum += gauss[8] * (at[-8 * stride] + at[8 * stride]);
+        out[k] = sum;
     }
 }
 

@@ -362,8 +362,9 @@ static tl_status read_points(const making *of, fbm_window window, float *out, tl
         return tl_fail_memory(error, of->name);
     tl_status status = scene_cell_store_read(of->means->points, wide, make_points, of, numbers, of->name, error);
     const double *from = numbers + (size_t)(window.j - wide.j) * wide.width + (size_t)(window.i - wide.i);
-    for (size_t k = 0; status == TL_OK && k < area(window); k++)
-        out[k] = (float)from[k / window.width * wide.width + k % window.width];
+    for (size_t row = 0; status == TL_OK && row < window.height; row++)
+        for (size_t k = 0; k < window.width; k++)
+            out[row * window.width + k] = (float)from[row * wide.width + k];
     free(numbers);
     return status;
 }

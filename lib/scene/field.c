@@ -154,8 +154,9 @@ static tl_status recall_maps(const field *f, fbm_window window, scene_planes *ou
         if (!out->of[p])
             continue;
         status = scene_cell_store_read(f->kept[p], wide, make[p], f, numbers, name, error);
-        for (size_t k = 0; status == TL_OK && k < window.width * window.height; k++)
-            out->of[p][k] = (float)numbers[first + k / window.width * wide.width + k % window.width];
+        for (size_t row = 0; status == TL_OK && row < window.height; row++)
+            for (size_t k = 0; k < window.width; k++)
+                out->of[p][row * window.width + k] = (float)numbers[first + row * wide.width + k];
     }
     free(numbers);
     return status;

@@ -496,11 +496,14 @@ static tl_status read_known(const tl_source *dem, bool reflect, scene_patch *g, 
     fbm_window w = g->window;
     tl_status status = reflect ? read_reflected(dem, w, g->heights, error) : read_ground(dem, w, g->heights, error);
     *all = true;
-    for (size_t k = 0; k < w.width * w.height && status == TL_OK; k++) {
-        int64_t x = w.i + (int64_t)(k % w.width), y = w.j + (int64_t)(k / w.width);
-        bool model = y >= 0 && y < dem->info.height && (dem->info.wraps || (x >= 0 && x < dem->info.width));
-        g->known[k] = isnan(g->heights[k]) ? UNKNOWN : model ? SCENE_MODEL : SCENE_BEYOND;
-        *all = *all && g->known[k];
+    for (size_t row = 0, k = 0; row < w.height && status == TL_OK; row++) {
+        const int64_t y = w.j + (int64_t)row;
+        const bool within = y >= 0 && y < dem->info.height;
+        for (int64_t x = w.i; x < w.i + (int64_t)w.width; x++, k++) {
+            bool model = within && (dem->info.wraps || (x >= 0 && x < dem->info.width));
+            g->known[k] = isnan(g->heights[k]) ? UNKNOWN : model ? SCENE_MODEL : SCENE_BEYOND;
+            *all = *all && g->known[k];
+        }
     }
     return status == TL_OK && dem->validity ? mark_filled(dem, g, error) : status;
 }
@@ -610,14 +613,15 @@ static bool unpack(const double *numbers, fbm_window of, scene_patch *out)
     const fbm_window w = out->window;
     const double *from = numbers + (size_t)(w.j - of.j) * of.width + (size_t)(w.i - of.i);
     bool all = true;
-    for (size_t k = 0; k < w.width * w.height; k++) {
-        uint64_t both;
-        memcpy(&both, &from[k / w.width * of.width + k % w.width], sizeof both);
-        const uint32_t height = (uint32_t)both;
-        memcpy(&out->heights[k], &height, sizeof height);
-        out->known[k] = (unsigned char)(both >> 32);
-        all = all && out->known[k] == SCENE_MODEL;
-    }
+    for (size_t row = 0, k = 0; row < w.height; row++)
+        for (size_t column = 0; column < w.width; column++, k++) {
+            uint64_t both;
+            memcpy(&both, &from[row * of.width + column], sizeof both);
+            const uint32_t height = (uint32_t)both;
+            memcpy(&out->heights[k], &height, sizeof height);
+            out->known[k] = (unsigned char)(both >> 32);
+            all = all && out->known[k] == SCENE_MODEL;
+        }
     return all;
 }
 
