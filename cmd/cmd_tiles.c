@@ -108,6 +108,7 @@ static void report(const settings *set, const tl_tiles_report *r, double seconds
         command_say(&set->common, "%s: at most %llu tiles of levels %d ... %d from %llu blocks; cells of %.3g %s",
                     folder, (unsigned long long)tiles, r->first_level, r->last_level, (unsigned long long)r->blocks,
                     r->spacing, set->format == TL_TILES_3D ? "m" : "degrees");
+        height_tiles_say_forecast(&set->common, &r->forecast, bytes);
         return;
     }
     if (r->complete && !tiles) {
@@ -240,7 +241,8 @@ static int run_tiles(const command *self, int argc, const char **argv, command_h
         {"outside", 0, OPTION_NUMBER, &set.outside, NULL, "METRES",
          "height of ground that the DEM does not know, of quantized-mesh (default: 0)", -1e5, 1e5, NULL},
         {"attribution", 0, OPTION_TEXT, &set.attribution, NULL, "TEXT", "to be shown with the terrain", 0, 0, NULL},
-        {"dry-run", 'n', OPTION_FLAG, &set.dry_run, NULL, NULL, "only tell how many tiles there will be", 0, 0, NULL},
+        {"dry-run", 'n', OPTION_FLAG, &set.dry_run, NULL, NULL,
+         "only tell how many tiles there will be, how large and in what time", 0, 0, NULL},
         {0}};
     const option heights[] = {HEIGHT_TILE_OPTIONS(set.heights), {0}};
     const option detail[] = {{"extra-levels", 'x', OPTION_INTEGER, &set.extra, NULL, "N",

@@ -1,6 +1,7 @@
 #include "cmd/height_tiles.h"
 
 #include <errno.h>
+#include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -113,6 +114,19 @@ static tl_status make_preset(const height_tiles *self, const common *shared, con
     return TL_OK;
 }
 
+void height_tiles_say_forecast(const common *shared, const tl_tiles_forecast *f, uint64_t bytes)
+{
+    char spread[64] = "";
+    if (f->spread > 0)
+        snprintf(spread, sizeof spread, ", give or take %.0f %%", ceil(100 * f->spread));
+    command_say(
+        shared,
+        "%s: about %.3g MB%s, and %.3g s with %u thread%s, besides the disk's time; by %llu tiles that were made "
+        "and not kept",
+        shared->output, 1e-6 * (double)bytes, spread, f->seconds, f->threads, f->threads == 1 ? "" : "s",
+        (unsigned long long)f->sampled);
+}
+
 static void tell(const height_tiles *self, const common *shared, const tl_grid_tiles_report *r)
 {
     uint64_t tiles = 0, bytes = 0;
@@ -128,9 +142,10 @@ static void tell(const height_tiles *self, const common *shared, const tl_grid_t
                     (unsigned long long)l->tiles, (long long)l->columns, (long long)l->rows, (long long)l->width,
                     (long long)l->height);
     }
-    if (self->options.dry_run)
+    if (self->options.dry_run) {
         command_say(shared, "%s: at most %llu tiles", shared->output, (unsigned long long)tiles);
-    else
+        height_tiles_say_forecast(shared, &r->forecast, bytes);
+    } else
         command_say(shared, "%s: %llu tiles, %llu bytes, heights from %g to %g%s", shared->output,
                     (unsigned long long)tiles, (unsigned long long)bytes, (double)r->low, (double)r->high,
                     r->complete ? "" : "; not complete until --finish");

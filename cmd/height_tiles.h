@@ -53,6 +53,8 @@ extern const char *const height_tile_compressions[];
 
 /* Reads what is left as text; told and false where it makes no sense. `format` is a name of a file's ending. */
 bool height_tiles_ok(height_tiles *self, const char *format, const tl_tiles_options *parts);
+/* Tells what a dry run expects, of tiles of any kind. */
+void height_tiles_say_forecast(const common *shared, const tl_tiles_forecast *forecast, uint64_t bytes);
 /* Makes the tiles and tells of them. */
 tl_status height_tiles_make(const height_tiles *self, const common *shared, const char *format, const tl_source *source,
                             const tl_run *run, tl_error *error);

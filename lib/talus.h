@@ -1242,7 +1242,7 @@ typedef struct tl_tiles_options {
      * every shards-th block of the deepest lattice. `finish` then makes all the rest. shards 0: everything. */
     unsigned shard, shards;
     bool finish;
-    bool dry_run; /* write nothing; tell how many tiles there will be at most */
+    bool dry_run; /* write nothing; tell how many tiles there will be at most, and what to expect */
     const tl_run *run;
 } tl_tiles_options;
 
@@ -1250,6 +1250,14 @@ typedef struct tl_tiles_level {
     uint64_t tiles, triangles, vertices, bytes;
     double error; /* metres: no tile's surface is farther from the heights on the deepest lattice */
 } tl_tiles_level;
+
+/* What a dry run expects, from tiles that it makes, without keeping them, from places all over the source. */
+typedef struct tl_tiles_forecast {
+    uint64_t sampled; /* such tiles */
+    double seconds;   /* of so many threads that have a core each, without what the disk takes */
+    unsigned threads;
+    double spread; /* two standard errors of all levels' bytes, as a share of them; NaN: not known */
+} tl_tiles_forecast;
 
 typedef struct tl_tiles_report {
     int first_level, last_level;
@@ -1260,6 +1268,7 @@ typedef struct tl_tiles_report {
     double spacing;               /* of the deepest lattice: degrees; metres of 3D Tiles */
     uint64_t blocks, done_before; /* of the work; those that an earlier call had done */
     bool complete;                /* the pyramid can be shown: layer.json or tileset.json is there */
+    tl_tiles_forecast forecast;   /* of a dry run, whose levels tell the most tiles there can be and bytes to expect */
 } tl_tiles_report;
 
 /* Writes a source as a pyramid of tiles for globes. Heights are taken as above the ellipsoid (see tl_geoid_create).
@@ -1325,10 +1334,11 @@ typedef struct tl_grid_tiles_level {
 typedef struct tl_grid_tiles_report {
     int level_count, first_level, last_level;
     tl_grid_tiles_level levels[TL_GRID_TILES_LEVELS];
-    float low, high;      /* of all tiles; NaN: none has heights */
-    uint64_t done_before; /* runs of tiles that an earlier call had made */
-    bool complete;        /* index.json is there */
-    bool already;         /* it was there before; nothing was done, and nothing is counted */
+    float low, high;            /* of all tiles; NaN: none has heights */
+    uint64_t done_before;       /* runs of tiles that an earlier call had made */
+    bool complete;              /* index.json is there */
+    bool already;               /* it was there before; nothing was done, and nothing is counted */
+    tl_tiles_forecast forecast; /* as in tl_tiles_report */
 } tl_grid_tiles_report;
 
 /* Cuts a source into square tiles of heights of all its levels: FOLDER/LEVEL/COLUMN_ROW.ENDING, columns from the west

@@ -372,13 +372,23 @@ static tl_status make_folders(const job *j, tl_error *error)
     return TL_OK;
 }
 
+/* As many threads as there is room for. */
+static tl_run workers_for(const job *j, size_t runs)
+{
+    tl_run workers = j->options->run ? *j->options->run : (tl_run){0};
+    double side = (double)j->cells + 1, tile = COPIES * side * side * sizeof(float);
+    workers.threads = tl_parallel_workers(j->options->run, runs);
+    if (workers.memory && tile * workers.threads > (double)workers.memory)
+        workers.threads = (double)workers.memory >= tile ? (unsigned)((double)workers.memory / tile) : 1;
+    return workers;
+}
+
 /* Makes what is not there: all, or one shard of it. */
 static tl_status make_runs(job *j, tl_error *error)
 {
     const tl_grid_tiles_options *o = j->options;
     making m = {j, tl_alloc(j->run_count, sizeof *m.waiting)};
     size_t count = 0;
-    tl_run workers = o->run ? *o->run : (tl_run){0};
     for (size_t k = 0; m.waiting && k < j->run_count; k++) {
         run *r = &j->runs[k];
         r->done = (o->resume || o->shards || o->finish) && load_run(j, r);
@@ -396,15 +406,105 @@ static tl_status make_runs(job *j, tl_error *error)
     uint64_t side = (uint64_t)j->cells + 1, samples = count * RUN * side * side;
     tl_status status = m.waiting ? make_folders(j, error) : tl_fail_memory(error, j->folder);
     double tile = COPIES * (double)(side * side) * sizeof(float);
-    unsigned most = tl_parallel_workers(o->run, count);
-    if (workers.memory && tile * most > (double)workers.memory) /* as many as there is room for */
-        most = (double)workers.memory >= tile ? (unsigned)((double)workers.memory / tile) : 1;
-    workers.threads = most;
+    const tl_run workers = workers_for(j, count);
     if (status == TL_OK)
         status = tl_run_fits(o->run, tile, j->source->info.name, "cutting it into tiles", error);
     if (status == TL_OK)
         status = tl_parallel_for(&workers, count, samples, make_run, &m, error);
     free(m.waiting);
+    return status;
+}
+
+/* ---- What to expect ---- */
+
+/* Means over tiles of a level that were made and removed again. */
+typedef struct level_sample {
+    int64_t count, all;
+    double bytes, spread; /* of a tile; two standard errors of all of them */
+    double seconds;
+} level_sample;
+
+/* `j` has a folder of its own. */
+static tl_status sample_level(const job *j, int k, level_sample *out, tl_error *error)
+{
+    enum { SHARE = 64, LEAST = 16, MOST = 48 };
+    const level *l = &j->levels[k];
+    double squares = 0, before = out_seconds_of_thread();
+    *out = (level_sample){.all = l->columns * l->rows};
+    out->count = tl_int64_min(tl_int64_min(tl_int64_max(out->all / SHARE, LEAST), MOST), out->all);
+    float *z = tl_alloc_grid(j->cells + 1, j->cells + 1, sizeof *z);
+    tl_status status = z ? TL_OK : tl_fail_memory(error, j->folder);
+    for (int64_t n = 0; n < out->count && status == TL_OK; n++) {
+        tile_record tile = {0};
+        char path[PATH_ROOM];
+        int64_t at = (int64_t)out_sample_place((size_t)n, (size_t)out->count, (size_t)out->all);
+        const run place = {.level = k, .row = at / l->columns};
+        status = tl_run_check(j->options->run, error);
+        if (status == TL_OK)
+            status = make_tile(j, &place, at % l->columns, z, &tile, error);
+        name_tile(j, k, at % l->columns, place.row, path);
+        unlink(path);
+        out->bytes += (double)tile.bytes / (double)out->count;
+        squares += (double)tile.bytes * (double)tile.bytes;
+    }
+    free(z);
+    double n = (double)out->count, off = fmax(squares - n * out->bytes * out->bytes, 0);
+    out->spread = out->count < out->all ? 2 * sqrt(off / (n - 1) / n * (1 - n / (double)out->all)) : 0;
+    out->seconds = (out_seconds_of_thread() - before) / n;
+    return status;
+}
+
+/* A tile takes time by its own samples, and by those of the source, four times as many from level to level; both by the
+ * two deepest levels. */
+static void expect(job *j, const level_sample sampled[2])
+{
+    tl_grid_tiles_report *r = j->report;
+    double own = sampled[0].seconds, read = fmax((sampled[1].seconds - own) / 3, 0), seconds = 0, bytes = 0, off = 0;
+    size_t runs = 0;
+    for (int k = r->last_level; k >= r->first_level; k--) {
+        double tiles = (double)(j->levels[k].columns * j->levels[k].rows);
+        const level_sample *like = &sampled[k < r->last_level];
+        runs += (size_t)(tl_div_up(j->levels[k].columns, RUN) * j->levels[k].rows);
+        r->levels[k].tiles = (uint64_t)tiles;
+        r->levels[k].bytes = (uint64_t)(tiles * like->bytes);
+        seconds += tiles * (own + (ldexp(1, 2 * (r->last_level - k)) - 1) * read);
+        bytes += tiles * like->bytes;
+        off += tiles * like->spread;
+    }
+    r->forecast.threads = workers_for(j, runs).threads;
+    r->forecast.seconds = seconds / r->forecast.threads;
+    r->forecast.spread = bytes > 0 ? off / bytes : (double)NAN;
+    r->forecast.sampled = (uint64_t)(sampled[0].count + sampled[1].count);
+}
+
+/* Tiles are made in a folder for what is temporary, and removed. */
+static tl_status forecast(job *j, tl_error *error)
+{
+    const tl_grid_tiles_report *r = j->report;
+    const char *place = getenv("TMPDIR"), *folder = j->folder;
+    char temporary[PATH_ROOM / 2], path[PATH_ROOM];
+    level_sample sampled[2] = {{0}};
+    tl_status status = find_range(j, error);
+    snprintf(temporary, sizeof temporary, "%s/talus-XXXXXX", place && *place ? place : "/tmp");
+    if (status == TL_OK && !mkdtemp(temporary))
+        status = tl_fail(error, TL_ERROR_IO, "%s: cannot be made; TMPDIR may name a place for it", temporary);
+    if (status != TL_OK)
+        return status;
+    j->folder = temporary;
+    for (int n = 0; n < 2 && status == TL_OK; n++) {
+        int k = r->last_level - n;
+        sampled[n] = sampled[0];
+        if (k < r->first_level)
+            continue;
+        snprintf(path, sizeof path, "%s/%d", temporary, k);
+        status = mkdir(path, 0777) ? tl_fail(error, TL_ERROR_IO, "%s: cannot be made", path)
+                                   : sample_level(j, k, &sampled[n], error);
+        rmdir(path);
+    }
+    rmdir(temporary);
+    j->folder = folder;
+    if (status == TL_OK)
+        expect(j, sampled);
     return status;
 }
 
@@ -544,11 +644,8 @@ static tl_status begin(job *j, tl_error *error)
 static tl_status work(job *j, tl_error *error)
 {
     tl_status status = open_levels(j, error);
-    if (status == TL_OK && j->options->dry_run) {
-        for (int k = j->report->first_level; k <= j->report->last_level; k++)
-            j->report->levels[k].tiles = (uint64_t)(j->levels[k].columns * j->levels[k].rows);
-        return TL_OK;
-    }
+    if (status == TL_OK && j->options->dry_run)
+        return forecast(j, error);
     if (status == TL_OK)
         status = find_range(j, error);
     if (status == TL_OK)

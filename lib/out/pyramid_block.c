@@ -312,6 +312,8 @@ static bool is_whole(const char *path, const out_piece_tile *tile)
 static tl_status write_tile(const out_pyramid *p, const out_piece_tile *tile, const void *bytes, tl_error *error)
 {
     char name[96];
+    if (p->rehearses)
+        return TL_OK;
     p->scheme->name(tile, name, sizeof name);
     char *path = out_inside(p->folder, name);
     if (!path)
@@ -521,5 +523,5 @@ tl_status out_block_make(const out_pyramid *p, out_block_worker *w, const out_bl
         status = make_tiles(p, w, at, piece, error);
     if (status == TL_OK && !empty && p->level > OUT_ROOT_LATTICE)
         status = fill_piece(w, piece, error);
-    return status == TL_OK ? out_piece_save(piece, p->folder, error) : status;
+    return status == TL_OK && !p->rehearses ? out_piece_save(piece, p->folder, error) : status;
 }

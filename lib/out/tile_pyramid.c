@@ -111,8 +111,7 @@ static tl_status take_pieces(out_pyramid *p, tl_error *error)
     return status;
 }
 
-/* Threads that the memory has room for. */
-static tl_run run_of(const out_pyramid *p)
+tl_run out_pyramid_run(const out_pyramid *p)
 {
     static const tl_run none;
     tl_run run = p->options->run ? *p->options->run : none;
@@ -133,7 +132,7 @@ static void free_workers(out_pyramid *p)
 
 static tl_status do_lattice(out_pyramid *p, tl_error *error)
 {
-    const tl_run run = run_of(p);
+    const tl_run run = out_pyramid_run(p);
     if (!p->workers && (p->workers = calloc(tl_parallel_workers(&run, UINT64_MAX >> 1), sizeof *p->workers)))
         p->worker_count = tl_parallel_workers(&run, UINT64_MAX >> 1);
     p->pieces = calloc(p->block_count, sizeof *p->pieces);
@@ -189,7 +188,7 @@ static tl_status list_blocks(out_pyramid *p, tl_error *error)
     return TL_OK;
 }
 
-/* Those of the shard, or the ones around them in the next coarser lattice. */
+/* Those of the shard. */
 static void take_shard(out_pyramid *p)
 {
     size_t kept = 0;
@@ -198,7 +197,7 @@ static void take_shard(out_pyramid *p)
     p->block_count = kept;
 }
 
-static tl_status go_up(out_pyramid *p, tl_error *error)
+tl_status out_pyramid_go_up(out_pyramid *p, tl_error *error)
 {
     free(p->finer);
     p->finer = tl_alloc(p->block_count, sizeof *p->finer);
@@ -228,29 +227,31 @@ static tl_status check_options(const tl_tiles_options *o, const char *folder, tl
     return TL_OK;
 }
 
-/* The most tiles that there can be: all that the source's box touches. */
-static void foresee(out_pyramid *p)
+uint64_t out_pyramid_foreseen(const out_pyramid *p, int level)
 {
-    tl_window w = p->scheme->window(p);
+    const tl_window w = p->scheme->window(p);
+    int64_t cells = (int64_t)OUT_TILE_CELLS << (p->deepest - level);
+    int64_t across = floor_div(w.x + w.width - 1, cells) - floor_div(w.x, cells) + 1;
+    int64_t down = floor_div(w.y + w.height - 1, cells) - floor_div(w.y, cells) + 1;
+    if (level == 0 && p->scheme->covers)
+        return (uint64_t)p->scheme->roots;
+    return (uint64_t)(tl_int64_min(across, (int64_t)p->scheme->roots << level) *
+                      tl_int64_min(down, INT64_C(1) << level));
+}
+
+static tl_status foresee(out_pyramid *p, tl_error *error)
+{
     p->report.blocks = p->block_count;
-    for (int level = p->deepest; level >= p->options->first_level; level--) {
-        int64_t cells = (int64_t)OUT_TILE_CELLS << (p->deepest - level);
-        int64_t across = floor_div(w.x + w.width - 1, cells) - floor_div(w.x, cells) + 1;
-        int64_t down = floor_div(w.y + w.height - 1, cells) - floor_div(w.y, cells) + 1;
-        p->report.levels[level].tiles = level == 0 && p->scheme->covers
-                                            ? (uint64_t)p->scheme->roots
-                                            : (uint64_t)(tl_int64_min(across, (int64_t)p->scheme->roots << level) *
-                                                         tl_int64_min(down, INT64_C(1) << level));
-    }
+    for (int level = p->deepest; level >= p->options->first_level; level--)
+        p->report.levels[level].tiles = out_pyramid_foreseen(p, level);
+    return out_pyramid_forecast(p, error);
 }
 
 static tl_status work(out_pyramid *p, tl_error *error)
 {
     tl_status status = list_blocks(p, error);
-    if (status != TL_OK || p->options->dry_run) {
-        foresee(p);
-        return status;
-    }
+    if (status != TL_OK || p->options->dry_run)
+        return status == TL_OK ? foresee(p, error) : status;
     status = out_sum_rows(p->source, &p->sum, error);
     if (status != TL_OK)
         return status;
@@ -277,7 +278,7 @@ static tl_status work(out_pyramid *p, tl_error *error)
     }
     while (status == TL_OK && !p->options->shards && p->level > OUT_ROOT_LATTICE &&
            p->level - 2 > p->options->first_level) {
-        status = go_up(p, error);
+        status = out_pyramid_go_up(p, error);
         if (status == TL_OK)
             status = do_lattice(p, error);
     }

@@ -45,6 +45,7 @@ typedef struct out_pyramid {
     out_block_place *finer; /* those of the lattice before */
     size_t finer_count;
     out_piece *pieces;                 /* of these blocks, without samples */
+    bool rehearses;                    /* blocks are made, but nothing is written */
     struct out_block_worker **workers; /* kept from one lattice above the deepest to the next */
     unsigned worker_count;
 } out_pyramid;
@@ -90,6 +91,20 @@ struct out_scheme {
 tl_status out_pyramid_make(out_pyramid *pyramid, tl_error *error);
 void out_pyramid_finish(out_pyramid *pyramid);
 
+/* Of a dry run: what there will be, into the report. `pyramid` has its blocks. */
+tl_status out_pyramid_forecast(out_pyramid *pyramid, tl_error *error);
+
+/* Which of `all` places to take as sample `number` of `count`: one from each stretch, at an irregular place of it, so
+ * that the columns of a grid that is counted by rows are all met. */
+size_t out_sample_place(size_t number, size_t count, size_t all);
+double out_seconds_of_thread(void); /* of a processor */
+
+/* Of the run: as many threads as the memory has room for. */
+tl_run out_pyramid_run(const out_pyramid *pyramid);
+/* From a lattice's blocks to those around them in the next coarser one. */
+tl_status out_pyramid_go_up(out_pyramid *pyramid, tl_error *error);
+/* The most tiles of a level that there can be: all that the source's box touches. */
+uint64_t out_pyramid_foreseen(const out_pyramid *pyramid, int level);
 /* The bound that a level's tiles are drawn to, metres. */
 double out_pyramid_bound(const out_pyramid *pyramid, int level);
 /* Blocks of a lattice beside and above each other. */

@@ -715,6 +715,29 @@ def tiles_of_nothing_are_refused(case):
     expect(tiles <= most <= tiles + 4, f"{foreseen} {made}")
 
 
+def dry_runs_foresee_within_two(case):
+    """Bytes and processor time to expect are within a factor of two, of a small model in many tiles and of a large one."""
+    def seconds():
+        used = resource.getrusage(resource.RUSAGE_CHILDREN)
+        return used.ru_utime + used.ru_stime
+    models = [(EXAMPLE, ("-l", "10..15")), (EXAMPLE, ("-f", "exr", "--tile", 33))]
+    try:
+        models.append((shared("dem", "alps_srtm3_3601x2401_tiled_lzw_p2.tif"), ("-e", 30)))
+    except Skip:
+        pass
+    for number, (model, options) in enumerate(models):
+        words = ("tiles", model, "-t", 1, *options, "-o", f"site{number}")
+        said = case.run(*words, "--dry-run").err
+        expect(not os.path.exists(case.path(f"site{number}")), "a dry run made a folder")
+        megabytes, foreseen = map(float, re.search(r"about ([0-9.e+]+) MB.*, and ([0-9.e+-]+) s with 1 thread", said).groups())
+        before = seconds()
+        made = int(re.search(r" tiles, (\d+) bytes", case.run(*words).err).group(1))
+        took = seconds() - before
+        expect(made / 2 < megabytes * 1e6 < made * 2, f"{model} {options}: {made} bytes; {said}")
+        # starting takes longer than tens of milliseconds of work; sanitizers slow down what they like
+        expect(is_sanitized(case.program) or took / 2 - 0.1 < foreseen < 2 * took + 0.1, f"{model} {options}: {took} s; {said}")
+
+
 def points_and_tiles_are_read_back(case):
     """info tells of points, of folders of tiles and what is in them, and of what a preset writes; damage is told."""
     def about(name, schema):
@@ -1456,7 +1479,7 @@ TESTS = [
     bar_only_on_a_terminal, progress_lines_are_json, quiet_is_silent,
     json_keeps_its_schema, reports_keep_their_schema, mbtiles_hold_the_folder, statistics_keep_their_schema, real_files_keep_the_schema, window_costs_its_blocks, a_part_is_that_part, corners_agree_with_gdal,
     names_of_any_bytes,
-    serves_the_folder_alone, tiles_of_nothing_are_refused, formats_hold_the_same_heights, outputs_are_read_back, points_and_tiles_are_read_back, sidecars_are_checked, outputs_are_made_again, png_within_half_a_step, point_samples_are_kept, point_samples_of_the_andes_are_kept,
+    serves_the_folder_alone, tiles_of_nothing_are_refused, dry_runs_foresee_within_two, formats_hold_the_same_heights, outputs_are_read_back, points_and_tiles_are_read_back, sidecars_are_checked, outputs_are_made_again, png_within_half_a_step, point_samples_are_kept, point_samples_of_the_andes_are_kept,
     area_means_stay_on_their_footprint,
     glb_is_in_metres, frames_agree, simplify_keeps_its_word, diagonals_are_turned, codings_keep_the_bound, layers_are_written_beside, inputs_are_not_overwritten, layers_are_refused_before_the_work, vertices_tell_where_they_came_from,
     flights_tell_how_far_ground_jumps, pictures_take_colours_of_rasters,
