@@ -719,7 +719,7 @@ def dry_runs_foresee_within_two(case):
     """Bytes and processor time to expect are within a factor of two, of a small model in many tiles and of a large one."""
     def seconds():
         used = resource.getrusage(resource.RUSAGE_CHILDREN)
-        return used.ru_utime + used.ru_stime
+        return used.ru_utime  # files are the system's time, as the disk has it
     models = [(EXAMPLE, ("-l", "10..15")), (EXAMPLE, ("-f", "exr", "--tile", 33))]
     try:
         models.append((shared("dem", "alps_srtm3_3601x2401_tiled_lzw_p2.tif"), ("-e", 30)))
