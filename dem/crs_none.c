@@ -16,8 +16,8 @@ enum { USER_DEFINED = 32767, CODE_WGS84 = 4326 };
 
 static tl_status lacks(const char *path, const char *what, tl_error *error)
 {
-    return tl_fail(error, TL_ERROR_ARGUMENT, "%s: %s takes PROJ, which this build of talus is without; take another",
-                   path, what);
+    return tl_fail(error, TL_ERROR_ARGUMENT,
+                   "%s: %s needs PROJ, which this build of talus is without; use one that has it", path, what);
 }
 
 /* ---- Reading ---- */

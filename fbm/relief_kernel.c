@@ -800,6 +800,7 @@ enum { SMOOTHING = 8 };
 static const float gauss[SMOOTHING + 1] = {1,          .8824969F,   .60653066F,   .32465247F,   .13533528F,
                                            .04393693F, .011108997F, .0021874911F, .00033546263F};
 
+_Static_assert(SMOOTHING == 8, "the sum's terms are written out");
 static void smooth_across(const float *in, ptrdiff_t stride, size_t count, float *restrict out)
 {
     for (ptrdiff_t k = 0; k < (ptrdiff_t)count; k++) {

@@ -706,7 +706,8 @@ static double exceeded_by(double chance)
     return low;
 }
 
-/* Relative variance of a position's mean, times its count: increments along rows and columns, `step` samples apart. */
+/* Relative variance of a position's mean, times its count: increments along rows and columns, `step` samples apart. -1:
+ * out of memory. */
 static double position_variance(double hurst, int step)
 {
     const fbm_sampling s = {.order = 2, .width = 1, .height = 1, .cell_x = 1, .cell_y = 1};
@@ -714,7 +715,7 @@ static double position_variance(double hurst, int step)
     double sum = 0;
     const increment kinds[2] = {{2, 1, 0}, {2, 1, 1}};
     if (!variogram_init(&v, &s, covariance_hurst(&s, hurst), 24))
-        return 0;
+        return -1;
     double scale = 1 / covariance_at(&v, kinds[0], kinds[0], 0, 0);
     for (int y = -16; y <= 16; y += step)
         for (int x = -16; x <= 16; x += step)
@@ -751,7 +752,9 @@ double fbm_position_ratio(const fbm_positions *p, int octave, double hurst, doub
     }
     if (!(least >= 16) || !(all_rows > 0) || !(all_columns > 0))
         return 0;
-    double z = exceeded_by(0.005 / (double)(side * side));
-    *limit = exp(2 * z * sqrt(position_variance(hurst, (int)side) / least));
+    double z = exceeded_by(0.005 / (double)(side * side)), variance = position_variance(hurst, (int)side);
+    if (variance < 0)
+        return -1;
+    *limit = exp(2 * z * sqrt(variance / least));
     return low > 0 ? high / low : HUGE_VAL;
 }

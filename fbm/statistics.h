@@ -44,7 +44,7 @@ void fbm_positions_add(const float *heights, size_t width, size_t height, uint64
 /* The largest over the smallest mean square by position modulo 2^octave (1 ... 3), each direction over its own mean.
  * *limit is what it stays below with a probability of at least 0.99 for stationary Gaussian increments of exponent
  * `hurst`: 2 z standard errors of a position's mean in the logarithm, with z exceeded once in 200 / positions. 0 where
- * a position has fewer than 16 increments. */
+ * a position has fewer than 16 increments; -1: out of memory. */
 double fbm_position_ratio(const fbm_positions *positions, int octave, double hurst, double *limit);
 
 /* How increments were sampled. */

@@ -36,7 +36,7 @@ const char *tl_grid_tiles_ending(tl_grid_tiles_format format)
     return (size_t)format < sizeof endings / sizeof *endings ? endings[format] : NULL;
 }
 
-/* A tile that is there; bytes 0: it is void, and there is no file. */
+/* A tile that is there; bytes 0: it is void, with low > high, and there is no file. */
 typedef struct tile_record {
     int64_t bytes;
     uint32_t checksum, nothing; /* so that records have no holes */
@@ -329,8 +329,9 @@ static bool load_run(const job *j, run *r)
         int64_t bytes;
         uint32_t checksum;
         name_tile(j, r->level, r->first + (int64_t)k, r->row, path);
-        whole = !r->tiles[k].bytes ||
-                (sum_file(path, &bytes, &checksum) && bytes == r->tiles[k].bytes && checksum == r->tiles[k].checksum);
+        whole = r->tiles[k].bytes ? sum_file(path, &bytes, &checksum) && bytes == r->tiles[k].bytes &&
+                                        checksum == r->tiles[k].checksum
+                                  : r->tiles[k].low > r->tiles[k].high; /* not so where a disk left zeros */
     }
     return whole;
 }

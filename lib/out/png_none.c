@@ -5,8 +5,8 @@
 
 static tl_status lacks(const char *path, tl_error *error)
 {
-    return tl_fail(error, TL_ERROR_ARGUMENT, "%s: PNG takes libpng, which this build of talus is without; take another",
-                   path);
+    return tl_fail(error, TL_ERROR_ARGUMENT,
+                   "%s: PNG needs libpng, which this build of talus is without; use one that has it", path);
 }
 
 tl_status out_png_begin(out_png *self, tl_output *output, out_png_kind kind, int64_t width, int64_t height)

@@ -32,16 +32,17 @@ static double sag(const out_pyramid *p, int lattice, int size)
 
 /* ---- Metadata ---- */
 
-/* Ten levels of tiles under a tile, of a sorted list; to be freed. */
+/* Ten levels of tiles under a tile, of a sorted list; to be freed. NULL: out of memory. */
 static char *describe_below(const out_tile_list *list, int level, int64_t column, int64_t row, int deepest)
 {
     json_t *available = json_array(), *root = json_pack("{s:o}", "available", available);
-    for (int below = 1; below <= METADATA_LEVELS && level + below <= deepest; below++) {
+    bool good = root != NULL;
+    for (int below = 1; good && below <= METADATA_LEVELS && level + below <= deepest; below++) {
         const out_tile_place first = {row << below, column << below},
                              last = {((row + 1) << below) - 1, ((column + 1) << below) - 1};
-        json_array_append_new(available, out_tile_list_ranges(list, level + below, first, last));
+        good = json_array_append_new(available, out_tile_list_ranges(list, level + below, first, last)) == 0;
     }
-    char *text = root ? json_dumps(root, JSON_COMPACT) : NULL;
+    char *text = good ? json_dumps(root, JSON_COMPACT) : NULL;
     json_decref(root);
     return text;
 }
@@ -68,16 +69,21 @@ static double shift_of(const out_drawn_tile *drawn)
 
 /* ---- layer.json ---- */
 
+/* NULL: out of memory. */
 static json_t *describe_levels(const out_pyramid *p)
 {
     json_t *available = json_array();
-    for (int level = 0; level <= p->deepest; level++) {
+    bool good = available != NULL;
+    for (int level = 0; good && level <= p->deepest; level++) {
         const out_tile_place first = {0, 0}, last = {INT64_MAX, INT64_MAX};
         json_t *ranges =
             level < p->options->first_level ? json_array() : out_tile_list_ranges(&p->list, level, first, last);
-        json_array_append_new(available, ranges);
+        good = json_array_append_new(available, ranges) == 0;
     }
-    return available;
+    if (good)
+        return available;
+    json_decref(available);
+    return NULL;
 }
 
 static char *describe_layer(const out_pyramid *p)
@@ -100,9 +106,9 @@ static char *describe_layer(const out_pyramid *p)
     json_object_set_new(root, "extensions", extensions);
     if (p->options->attribution)
         json_object_set_new(root, "attribution", json_string(p->options->attribution));
-    json_object_set_new(root, "available", describe_levels(p));
+    bool good = json_object_set_new(root, "available", describe_levels(p)) == 0;
     json_object_set_new(root, "talus", out_describe_record(p));
-    char *text = json_dumps(root, JSON_INDENT(1) | JSON_REAL_PRECISION(17));
+    char *text = good ? json_dumps(root, JSON_INDENT(1) | JSON_REAL_PRECISION(17)) : NULL;
     json_decref(root);
     return text;
 }
@@ -156,9 +162,10 @@ static tl_status encode(const out_pyramid *p, void *worker, const out_drawn_tile
 {
     out_terrain_buffer *buffer = worker;
     double quantum = 0;
-    char *metadata = tile->level % METADATA_LEVELS == 0 && tile->level < p->deepest
-                         ? describe_below(drawn->below, tile->level, tile->column, tile->row, p->deepest)
-                         : NULL;
+    const bool tells = tile->level % METADATA_LEVELS == 0 && tile->level < p->deepest;
+    char *metadata = tells ? describe_below(drawn->below, tile->level, tile->column, tile->row, p->deepest) : NULL;
+    if (tells && !metadata)
+        return tl_fail_memory(error, p->folder);
     const out_terrain_tile terrain = {.level = tile->level,
                                       .column = tile->column,
                                       .row = tile->row,

@@ -259,15 +259,13 @@ static tl_status write_subtrees(const out_pyramid *p, const out_nodes *nodes, in
 
 /* The region of the whole square, so that readers who divide it evenly find the tiles; false where there is none on
  * the globe, or the tiles are no boxes of longitude and latitude. */
-static bool square_region(const out_pyramid *p, const out_node *root, double out[6])
+static bool square_region(const out_pyramid *p, scene_placer *placer, const out_node *root, double out[6])
 {
     const double side = (double)((int64_t)OUT_TILE_CELLS << p->deepest), x[2] = {0, side}, y[2] = {0, side};
     double longitude[2], latitude[2];
-    scene_placer *placer = scene_own_lattice_is_geographic(p->lattice) ? scene_placer_create(p->lattice, NULL) : NULL;
-    if (!placer)
+    if (!scene_own_lattice_is_geographic(p->lattice))
         return false;
     scene_placer_lonlat(placer, 2, x, y, longitude, latitude);
-    scene_placer_destroy(placer);
     /* to the west a whole turn less where it begins beyond the antimeridian */
     double turn = 2 * pi * rint(longitude[0] / (2 * pi));
     const double region[6] = {longitude[0] - turn, latitude[0],     longitude[1] - turn,
@@ -339,15 +337,12 @@ static void hold_content(scene_placer *placer, const tl_window *all, const out_n
 /* For maps, and across the antimeridian: the lattice's square on the plane under the source's middle. Readers who
  * divide it evenly miss the tiles by what the map and the plane differ, 0.01 % of its side at 100 km; those who read
  * the tiles' own regions do not. */
-static json_t *square_box(const out_pyramid *p, const out_node *root)
+static json_t *square_box(const out_pyramid *p, scene_placer *placer, const out_node *root)
 {
     const tl_window all = scene_own_lattice_window(p->lattice);
     const double side = (double)((int64_t)OUT_TILE_CELLS << p->deepest);
     double step[2];
-    scene_placer *placer = scene_placer_create(p->lattice, NULL);
     box b = {.low = {0}};
-    if (!placer)
-        return NULL;
     find_axes(placer, &all, &b, step);
     const double size[2] = {(double)(all.width - 1), (double)(all.height - 1)};
     for (int a = 0; a < 2; a++) {
@@ -355,7 +350,6 @@ static json_t *square_box(const out_pyramid *p, const out_node *root)
         b.high[a] = (side - 0.5 * size[a]) * step[a];
     }
     hold_content(placer, &all, root, &b);
-    scene_placer_destroy(placer);
     json_t *out = json_array();
     double half[3];
     for (int axis = 0; axis < 3; axis++)
@@ -373,12 +367,18 @@ static json_t *square_box(const out_pyramid *p, const out_node *root)
     return json_pack("{s:o}", "box", out);
 }
 
+/* NULL: out of memory. */
 static json_t *describe_volume(const out_pyramid *p, const out_node *root)
 {
     double region[6];
-    bool square = square_region(p, root, region), wide = root->region[2] - root->region[0] > 0.5;
+    scene_placer *placer = scene_placer_create(p->lattice, NULL);
+    if (!placer)
+        return NULL;
+    bool square = square_region(p, placer, root, region), wide = root->region[2] - root->region[0] > 0.5;
+    json_t *around = !square && !wide ? square_box(p, placer, root) : NULL;
+    scene_placer_destroy(placer);
     if (!square && !wide)
-        return square_box(p, root);
+        return around;
     if (!square)
         write_region(root->region, region);
     return json_pack("{s:[f,f,f,f,f,f]}", "region", region[0], region[1], region[2], region[3], region[4], region[5]);

@@ -29,9 +29,10 @@ int meshopt_decodeIndexBuffer(void *to, size_t count, size_t size, const unsigne
 
 static inline tl_status out_lacks_codecs(const char *path, tl_error *error)
 {
-    return tl_fail(error, TL_ERROR_ARGUMENT,
-                   "%s: compressed triangles take meshoptimizer, which this build of talus is without; take quantized",
-                   path);
+    return tl_fail(
+        error, TL_ERROR_ARGUMENT,
+        "%s: compressed triangles need meshoptimizer, which this build of talus is without; quantized ones do not",
+        path);
 }
 
 #endif

@@ -367,16 +367,19 @@ static tl_status tell_normality(const tl_source_info *info, const sums *all, tl_
 
 /* Squares vary by 2 + excess kurtosis of their mean's square, 2 for Gaussian increments: heavy tails widen the limit.
  */
-static void tell_positions(const fbm_positions *positions, tl_statistics *out)
+static tl_status tell_positions(const fbm_positions *positions, const char *name, tl_statistics *out, tl_error *error)
 {
     if (out->estimates[0].refusal)
-        return;
+        return TL_OK;
     double tails = sqrt(fmax(1, 1 + 0.5 * (out->normality_lag == 1 ? out->kurtosis : 0)));
     for (int k = 1; k <= FBM_POSITION_OCTAVES; k++) {
         double limit;
         out->positions[k - 1] = fbm_position_ratio(positions, k, out->estimates[0].hurst, &limit);
+        if (out->positions[k - 1] < 0)
+            return tl_fail_memory(error, name);
         out->position_limits[k - 1] = limit > 0 ? pow(limit, tails) : 0;
     }
+    return TL_OK;
 }
 
 static double mean_square(const fbm_moments *m)
@@ -562,7 +565,8 @@ static tl_status tell_all(measuring *m, tl_statistics *out, tl_error *error)
     tl_status status = tell_fits(info, &m->total.sums, out, error);
     if (status == TL_OK)
         status = tell_normality(info, &m->total.sums, out, error);
-    tell_positions(&m->total.positions, out);
+    if (status == TL_OK)
+        status = tell_positions(&m->total.positions, info->name, out, error);
     tell_octaves(m->total.octaves, info->type == TL_RASTER_AREA, out);
     return status == TL_OK ? tell_spectrum(m->source, out, error) : status;
 }
