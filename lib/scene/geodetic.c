@@ -218,13 +218,15 @@ static void fill_patch(const scene_geodetic *g, const patch *of, const places *a
     const tl_source_info *info = &g->source->info;
     const tl_window *w = &of->window;
     const float unit = (float)info->georef.height_unit;
-    if (p && g->upright)
+    const bool grid = p && g->upright;
+    if (grid)
         scene_part_heights(p, info, w->width, at->grid.x, w->height, at->grid.y, of->out, of->stride);
     for (int64_t y = 0; y < w->height; y++) {
         float *row = of->out + y * of->stride;
-        const double *here = at->all + 2 * y * w->width;
-        for (int64_t x = 0; x < w->width && !(p && g->upright); x++)
-            row[x] = p ? scene_part_height(p, info, here[2 * x], here[2 * x + 1]) : NAN;
+        for (int64_t x = 0; x < w->width && !grid; x++) {
+            size_t k = 2 * (size_t)(y * w->width + x);
+            row[x] = p ? scene_part_height(p, info, at->all[k], at->all[k + 1]) : NAN;
+        }
         for (int64_t x = 0; x < w->width; x++)
             row[x] *= unit;
     }

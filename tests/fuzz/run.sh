@@ -22,12 +22,13 @@ build=$folder/build
     cat "$folder/setup.log"
     exit 1
 }
-ninja -C "$build" --quiet tests/fuzz/corpus $(for t in $targets; do echo "tests/fuzz/fuzz_${t%:*}"; done)
-
 # A small quarantine and short traces: three times as many executions. What a file may cost: 256 MB at once and 5 s.
 ASAN_OPTIONS=quarantine_size_mb=16:malloc_context_size=6
 UBSAN_OPTIONS=halt_on_error=1:print_stacktrace=1
 export ASAN_OPTIONS UBSAN_OPTIONS
+
+# A fault in making the seeds ends it, too.
+ninja -C "$build" --quiet tests/fuzz/corpus $(for t in $targets; do echo "tests/fuzz/fuzz_${t%:*}"; done)
 
 run() { # NAME LENGTH
     found=$here/tests/fuzz/found/$1
