@@ -214,8 +214,8 @@ static tl_status paste_member(canvas *c, const dem_placement *p, tl_error *error
 /* The samples of the finest level under a window. */
 static tl_window at_finest(const canvas *c, tl_window window)
 {
-    return (tl_window){window.x << c->halvings, window.y << c->halvings, window.width << c->halvings,
-                       window.height << c->halvings};
+    const int64_t step = INT64_C(1) << c->halvings; /* windows may begin before the first sample */
+    return (tl_window){window.x * step, window.y * step, window.width * step, window.height * step};
 }
 
 static tl_status paste_layer(canvas *c, const dem_layer *layer, tl_error *error)
