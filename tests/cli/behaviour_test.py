@@ -1196,19 +1196,27 @@ def commands(case):
     return {name: re.findall(r"^ +(?:-\w, )?--([\w-]+)", case.run("help", name).out, flags=re.M) for name in names}
 
 
+def manual(name):
+    with open(os.path.join(ROOT, "doc", f"{name}.1.scd"), encoding="utf-8") as file:
+        return file.read()
+
+
 def manuals_and_help_agree(case):
-    """Every option is in the man page, and every option that the man page or the README names is some command's."""
+    """Every option is in the pages of its command, and every option that a page or the README names is some command's."""
     known = commands(case)
     expect(len(known) == 11 and all(known.values()), f"{known}")
-    with open(os.path.join(ROOT, "doc", "talus.1.scd"), encoding="utf-8") as file:
-        page = file.read()
-    for name, options in known.items():
-        expect(f"*talus {name}*" in page and f"## {name}" in page, f"{name} is not in the man page")
-        for option in options:
-            expect(f"--{option}*" in page, f"--{option} of {name} is not in the man page")
+    common = manual("talus")
     every = {option for options in known.values() for option in options} | {"help", "version"}
-    for option in re.findall(r"\*--([a-z][\w-]*)\*", page):
-        expect(option in every, f"--{option} of the man page is no command's")
+    for option in re.findall(r"\*--([a-z][\w-]*)\*", common):
+        expect(option in every, f"--{option} of talus(1) is no command's")
+    for name, options in known.items():
+        page = manual(f"talus-{name}")
+        expect(f"*talus {name}*" in common and f"*talus-{name}*(1)" in common, f"{name} is not in talus(1)")
+        expect(f"*talus {name}*" in page, f"{name} has no synopsis")
+        for option in options:
+            expect(f"--{option}*" in common + page, f"--{option} of {name} is not in its pages")
+        for option in re.findall(r"\*--([a-z][\w-]*)\*", page):
+            expect(option in every, f"--{option} of talus-{name}(1) is no command's")
     for line in commands_in_readme():
         name = line.split()[1]
         for option in re.findall(r" --([a-z][\w-]*)", line):
