@@ -417,6 +417,46 @@ static void expect_no_pyramid(const char *path, const grid *of, bool exact, tl_s
     tl_source_destroy(source);
 }
 
+/* The one digit after "base " in the file that makes another number of codes of it. */
+static void change_base(const char *path)
+{
+    static const char mark[] = " base ";
+    char text[4096];
+    FILE *file = fopen(path, "r+b");
+    assert_non_null(file);
+    size_t size = 0, at = 0;
+    for (long offset = 0; !at; offset += (long)(sizeof text - sizeof mark)) {
+        assert_int_equal(fseek(file, offset, SEEK_SET), 0);
+        size = fread(text, 1, sizeof text, file);
+        assert_true(size > sizeof mark);
+        for (size_t k = 0; k + sizeof mark < size && !at; k++)
+            if (memcmp(text + k, mark, sizeof mark - 1) == 0) {
+                at = (size_t)offset + k + sizeof mark - 1;
+                text[0] = text[k + sizeof mark - 1];
+            }
+    }
+    assert_int_equal(fseek(file, (long)at, SEEK_SET), 0);
+    assert_int_not_equal(fputc(text[0] == '1' ? '3' : '1', file), EOF);
+    assert_int_equal(fclose(file), 0);
+}
+
+/* Codes count from a base that only the label tells: another one would be other errors, or none. */
+static void pyramidsOfAnotherBaseAreDamaged(void **state)
+{
+    (void)state;
+    char path[64];
+    snprintf(path, sizeof path, "%s/pyramid.tif", folder);
+    random_state = 7;
+    grid of = make_grid(65, 40, (terrain)0, VOIDS_NONE);
+    tl_pyramid *made = build(&of, false, 1);
+    assert_int_equal(tl_pyramid_save(made, path, &(tl_write_options){0}, NULL), TL_OK);
+    change_base(path);
+    expect_no_pyramid(path, &of, false, TL_ERROR_DATA);
+    tl_pyramid_destroy(made);
+    assert_int_equal(unlink(path), 0);
+    free(of.z);
+}
+
 /* A saved pyramid comes back as it was, for the same heights and options; a damaged one does not. */
 static void pyramidsAreUsedAgainForTheSameHeights(void **state)
 {
@@ -533,6 +573,7 @@ int main(void)
         cmocka_unit_test(budgetsAreExactAndNest),
         cmocka_unit_test(pyramidDoesNotDependOnThreads),
         cmocka_unit_test(pyramidsAreUsedAgainForTheSameHeights),
+        cmocka_unit_test(pyramidsOfAnotherBaseAreDamaged),
         cmocka_unit_test(kernelsAgreeBitForBit),
     };
     return cmocka_run_group_tests(tests, make_folder, remove_folder);

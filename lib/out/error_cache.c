@@ -12,16 +12,21 @@
 #include <inttypes.h>
 #include <stdio.h>
 
-enum { GDAL_METADATA = 42112, LABEL_LIMIT = 200, BAND = 64 };
+enum {
+    GDAL_METADATA = 42112,
+    LABEL_LIMIT = 200,
+    BAND = 64,
+    BASE_LIMIT = (0x7f800000 >> 19) - 255 /* codes above it would pass infinity */
+};
 
 #define ITEM "error_pyramid"
 
 /* ---- The label ---- */
 
-/* What a pyramid's file must say to be this one's; `contents` is the checksum of its keys. */
+/* What a pyramid's file must say to be this one's; `contents` is the checksum of its keys and their base. */
 static void make_label(const tl_pyramid *pyramid, uint64_t contents, char text[LABEL_LIMIT])
 {
-    snprintf(text, LABEL_LIMIT, "1 talus %s of %016" PRIx64 " %s %s base %d contents %016" PRIx64, tl_version(),
+    snprintf(text, LABEL_LIMIT, "2 talus %s of %016" PRIx64 " %s %s base %d contents %016" PRIx64, tl_version(),
              pyramid->checksum, pyramid->bends ? "bent" : "flat", pyramid->codes ? "codes" : "floats",
              (int)pyramid->base, contents);
 }
@@ -35,7 +40,7 @@ static uint64_t mix(uint64_t hash, uint64_t value)
 static uint64_t sum_contents(const tl_pyramid *pyramid)
 {
     size_t samples = (size_t)pyramid->shape->info.width * (size_t)pyramid->shape->info.height;
-    uint64_t hash[4] = {1, 2, 3, 4};
+    uint64_t hash[4] = {1, 2, 3, 4 + (uint64_t)pyramid->base};
     for (size_t i = 0; i < samples; i++)
         hash[i & 3] = mix(hash[i & 3], tl_pyramid_key(pyramid, i));
     return mix(mix(mix(hash[0], hash[1]), hash[2]), hash[3]);
@@ -132,16 +137,17 @@ static tl_status read_label(const char *path, char label[LABEL_LIMIT], tl_error 
     return tl_fail(error, TL_ERROR_ARGUMENT, "%s: not an error pyramid of talus; name another file", path);
 }
 
+/* False where a value is no error and no code. */
 static bool take_rows(tl_pyramid *to, int64_t y, int64_t rows, const float *values)
 {
     size_t width = (size_t)to->shape->info.width, first = (size_t)y * width;
     for (size_t i = 0; i < width * (size_t)rows; i++) {
-        if (!to->codes)
-            to->errors[first + i] = values[i] < FLT_MAX ? values[i] : INFINITY;
-        else if (values[i] >= 0 && values[i] <= 255)
+        if (!(values[i] >= 0) || (to->codes && values[i] > 255))
+            return false;
+        if (to->codes)
             to->codes[first + i] = (unsigned char)values[i];
         else
-            return false;
+            to->errors[first + i] = values[i] < FLT_MAX ? values[i] : INFINITY;
     }
     return true;
 }
@@ -169,7 +175,7 @@ static tl_status load(tl_pyramid *to, const char *path, const char *label, tl_er
     to->base = base ? (int32_t)strtol(base + 6, NULL, 10) : 0;
     make_label(to, 0, expected);
     const char *contents = strstr(expected, " contents ");
-    if (to->base < 0 || to->base > 4080 || strncmp(expected, label, (size_t)(contents - expected)) != 0)
+    if (to->base < 0 || to->base > BASE_LIMIT || strncmp(expected, label, (size_t)(contents - expected)) != 0)
         return tl_fail(error, TL_ERROR_DATA, "%s: was made of other heights, or by another version", path);
     tl_source *from = tl_dem_open(&path, 1, NULL, error);
     if (!from)
