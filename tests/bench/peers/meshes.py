@@ -1,7 +1,7 @@
-#!/usr/bin/env python3
+#!/usr/bin/python3
 """Terrain meshes by talus and by its peers, side by side, as a Markdown table.
 
-  compare.py TALUS DEM FOLDER [--install] [--size 1025] [--errors 5,20,50]
+  meshes.py TALUS DEM FOLDER [--install] [--size 1025] [--errors 5,20,50]
 
 The first SIZE x SIZE samples of the DEM (SIZE is 2^k + 1, as martini asks) are simplified by `talus simplify`, by
 @mapbox/martini and by delatin, which npm has put into FOLDER; with --install, npm is asked to do so first. Nothing else
@@ -11,28 +11,15 @@ Every mesh is measured by mesh.mjs against every sample: the error in the table 
 of the whole process, with starting, reading and writing; each is the least of three runs."""
 import argparse
 import json
-import os
 import pathlib
 import subprocess
 import sys
 import tempfile
 
+from measure import measured
+
 HERE = pathlib.Path(__file__).resolve().parent
 PEERS = {"martini": "@mapbox/martini@0.2.0", "delatin": "delatin@0.2.0"}
-RUNS = 3
-
-
-def measured(command):
-    """Least CPU seconds and peak megabytes of a command's process; None where it fails."""
-    best = []
-    for _ in range(RUNS):
-        child = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        _, status, usage = os.wait4(child.pid, 0)
-        child.returncode = os.waitstatus_to_exitcode(status)
-        if child.returncode:
-            return None
-        best.append((usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024))
-    return min(b[0] for b in best), min(b[1] for b in best)
 
 
 def cut(dem, size, folder):
