@@ -6,10 +6,10 @@ command -v clang-format >/dev/null || {
     echo "clang-format is not installed"
     exit 77
 }
-# git knows what belongs to the project; without it, all but build folders and hidden ones
+# git knows what belongs to the project; without it, all but build folders (debhelper's is obj-MACHINE) and hidden ones
 list() {
     git ls-files -- '*.c' '*.h' '*.cpp' 2>/dev/null | grep . ||
-        find . \( -name '.?*' -o -name 'build*' \) -prune -o \( -name '*.c' -o -name '*.h' -o -name '*.cpp' \) -print
+        find . \( -name '.?*' -o -name 'build*' -o -name 'obj-*' \) -prune -o \( -name '*.c' -o -name '*.h' -o -name '*.cpp' \) -print
 }
 # a check that cannot fail is none
 if printf 'int  a ;\n' | clang-format --style=file --assume-filename=a.c --dry-run -Werror 2>/dev/null; then

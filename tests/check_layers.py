@@ -115,7 +115,7 @@ def files(root):
         return [name for name in listed.stdout.decode().split("\0") if name and os.path.exists(os.path.join(root, name))]
     found = []
     for folder, folders, names in os.walk(root):
-        folders[:] = [name for name in folders if not name.startswith((".", "build"))]
+        folders[:] = [name for name in folders if not name.startswith((".", "build", "obj-"))]
         found += [os.path.relpath(os.path.join(folder, name), root) for name in names]
     return found
 
