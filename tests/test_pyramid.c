@@ -565,16 +565,11 @@ static void kernelsAgreeBitForBit(void **state)
 int main(void)
 {
     const struct CMUnitTest tests[] = {
-        cmocka_unit_test(pyramidIsTheDefinitionOnRandomDems),
-        cmocka_unit_test(pyramidIsTheDefinitionAcrossBlocks),
-        cmocka_unit_test(pyramidIsTheDefinitionAboveBlocks),
-        cmocka_unit_test(pyramidGivesTheFrameworkOfEveryBound),
-        cmocka_unit_test(pyramidIsStrictForEveryBound),
-        cmocka_unit_test(budgetsAreExactAndNest),
-        cmocka_unit_test(pyramidDoesNotDependOnThreads),
-        cmocka_unit_test(pyramidsAreUsedAgainForTheSameHeights),
-        cmocka_unit_test(pyramidsOfAnotherBaseAreDamaged),
-        cmocka_unit_test(kernelsAgreeBitForBit),
+        cmocka_unit_test(pyramidIsTheDefinitionOnRandomDems), cmocka_unit_test(pyramidIsTheDefinitionAcrossBlocks),
+        cmocka_unit_test(pyramidIsTheDefinitionAboveBlocks),  cmocka_unit_test(pyramidGivesTheFrameworkOfEveryBound),
+        cmocka_unit_test(pyramidIsStrictForEveryBound),       cmocka_unit_test(budgetsAreExactAndNest),
+        cmocka_unit_test(pyramidDoesNotDependOnThreads),      cmocka_unit_test(pyramidsAreUsedAgainForTheSameHeights),
+        cmocka_unit_test(pyramidsOfAnotherBaseAreDamaged),    cmocka_unit_test(kernelsAgreeBitForBit),
     };
     return cmocka_run_group_tests(tests, make_folder, remove_folder);
 }
