@@ -1,260 +1,51 @@
-/* Thirty levels deep: the chain in single precision against the same recursion in long double, with the same noise,
- * weights by the table and not rounded. */
-#include "fbm/rng.h"
-#include "lib/scene/chain.h"
+/* Thirty levels deep: the chain in single precision against the same recursion in long double. */
+#include "lib/talus.h"
 
 #include <math.h>
 #include <setjmp.h>
 #include <stdarg.h>
-#include <stdbool.h>
-#include <stdlib.h>
 #include <string.h>
 
 #include <cmocka.h>
 
-enum { DEPTH = 30, SEED = 7, MOST = 64, COLUMNS = 21, ROWS = 17 };
-
-/* A field: heights of level 0 within +-delta, and at its nodes an exponent, one or one of two in turn. */
-typedef struct model {
-    double delta, hurst[2];
-    bool placed;
-} model;
-
-static double height_at(const model *m, int64_t i, int64_t j)
-{
-    uint64_t x = ((uint64_t)i * 0x9e3779b97f4a7c15U) ^ ((uint64_t)j * 0xc2b2ae3d27d4eb4fU);
-    x = (x ^ x >> 29) * 0xbf58476d1ce4e5b9U;
-    return (double)(float)(m->delta * ((double)(x >> 40) / (1 << 23) - 1));
-}
-
-static double hurst_at(const model *m, int64_t i, int64_t j)
-{
-    return (double)(float)m->hurst[(i + j) & 1];
-}
-
-static tl_status load(void *context, fbm_window w, float *buffer, float *const planes[SCENE_PLANES], tl_error *error)
-{
-    (void)error;
-    const model *m = context;
-    for (size_t y = 0; y < w.height; y++)
-        for (size_t x = 0; x < w.width; x++) {
-            int64_t i = w.i + (int64_t)x, j = w.j + (int64_t)y;
-            buffer[y * w.width + x] = (float)height_at(m, i, j);
-            if (planes[SCENE_STRENGTH])
-                planes[SCENE_STRENGTH][y * w.width + x] = (float)m->delta;
-            if (planes[SCENE_HURST])
-                planes[SCENE_HURST][y * w.width + x] = (float)hurst_at(m, i, j);
-        }
-    return TL_OK;
-}
-
-/* ---- The reference --------------------------------------------------------------------------------- */
-
-/* Coefficients of an orbit each: w[0 ... 3], t[0 ... 2] with the amplitude; of edges the taps are less. */
-typedef struct coefficients {
-    long double w[4], t[3], edge[3];
-} coefficients;
-
-static void at_exponent(const model *m, int level, double hurst, coefficients *out)
-{
-    double v[FBM_WEIGHT_VALUES];
-    fbm_values_table(hurst, v);
-    long double amplitude = (long double)m->delta * exp2l(-(long double)level * (long double)hurst);
-    const int w[4] = {0, 1, 3, 4}, t[3] = {6, 7, 9}, edge[3] = {18, 19, 20};
-    for (int k = 0; k < 4; k++)
-        out->w[k] = (long double)v[w[k]];
-    for (int k = 0; k < 3; k++) {
-        out->t[k] = amplitude * (long double)v[t[k]];
-        out->edge[k] = amplitude * (long double)v[edge[k]];
-    }
-}
-
-/* At a vertex of coefficients, (i, j) of level `of`: the exponent is bilinear between the nodes. */
-static void at_vertex(const model *m, int level, int of, int64_t i, int64_t j, coefficients *out)
-{
-    int64_t unit = (int64_t)1 << of, i0 = i >> of, j0 = j >> of;
-    double x = (double)(i - i0 * unit) / (double)unit, y = (double)(j - j0 * unit) / (double)unit;
-    double above = (1 - x) * hurst_at(m, i0, j0) + x * hurst_at(m, i0 + 1, j0);
-    double below = (1 - x) * hurst_at(m, i0, j0 + 1) + x * hurst_at(m, i0 + 1, j0 + 1);
-    at_exponent(m, level, (1 - y) * above + y * below, out);
-}
-
-/* What `where` is asked for lies in a grid of vertices that is made once a level. */
-typedef struct grid {
-    int shift;
-    int64_t i, j;
-    coefficients *vertices; /* MOST * MOST */
-} grid;
-
-static void make_grid(const model *m, int level, fbm_window from, grid *g)
-{
-    g->shift = level < FBM_PLACES_SHIFT ? level : FBM_PLACES_SHIFT;
-    g->i = from.i >> g->shift;
-    g->j = from.j >> g->shift;
-    for (int y = 0; y <= (int)(from.height >> g->shift) + 2; y++)
-        for (int x = 0; x <= (int)(from.width >> g->shift) + 2; x++)
-            if (m->placed)
-                at_vertex(m, level, level - g->shift, g->i + x, g->j + y, &g->vertices[y * MOST + x]);
-            else if (x + y == 0)
-                at_exponent(m, level, hurst_at(m, 0, 0), &g->vertices[0]);
-            else
-                g->vertices[y * MOST + x] = g->vertices[0];
-}
-
-/* Bilinear at half cells (i2, j2) of the level's lattice. */
-static coefficients where(const grid *g, int64_t i2, int64_t j2)
-{
-    int64_t x2 = i2 - 2 * g->i * ((int64_t)1 << g->shift), y2 = j2 - 2 * g->j * ((int64_t)1 << g->shift);
-    int64_t unit = (int64_t)2 << g->shift, x = x2 / unit, y = y2 / unit;
-    long double u = (long double)(x2 % unit) / (long double)unit, v = (long double)(y2 % unit) / (long double)unit;
-    const coefficients *at = &g->vertices[y * MOST + x];
-    const long double *corners[4] = {at->w, at[1].w, at[MOST].w, at[MOST + 1].w};
-    coefficients out;
-    long double *to = out.w;
-    for (size_t k = 0; k < sizeof out / sizeof(long double); k++)
-        to[k] =
-            (1 - v) * ((1 - u) * corners[0][k] + u * corners[1][k]) + v * ((1 - u) * corners[2][k] + u * corners[3][k]);
-    return out;
-}
-
-/* Heights and noise on the lattice of half cells, where any new vertex sees others at the same offsets. */
-typedef struct sheet {
-    int64_t i, j; /* half cells */
-    long double z[2 * MOST][2 * MOST], g[2 * MOST][2 * MOST];
-} sheet;
-
-/* Sums of the points at (+-a, +-b) and (+-b, +-a) half cells, each once. */
-static long double orbit(long double (*rows)[2 * MOST], int x, int y, int a, int b)
-{
-    long double sum = 0;
-    for (int turn = 0; turn < (a == b ? 1 : 2); turn++)
-        for (int s = -1; s <= 1; s += 2)
-            for (int t = -1; t <= 1; t += 2) {
-                int dx = turn ? s * b : s * a, dy = turn ? t * a : t * b;
-                if ((dx || s > 0) && (dy || t > 0))
-                    sum += rows[y + dy][x + dx];
-            }
-    return sum;
-}
-
-static void noise_of(sheet *s, int level, fbm_window from, fbm_noise_kind kind, int dx, int dy)
-{
-    float row[MOST];
-    for (size_t y = 0; y < from.height; y++) {
-        fbm_noise_row(SEED, level, kind, from.j + (int64_t)y, from.i, from.width, row);
-        for (size_t x = 0; x < from.width; x++)
-            s->g[2 * y + (size_t)dy][2 * x + (size_t)dx] = (long double)row[x];
-    }
-}
-
-/* One level: centres of the cells, then middles of the edges, over the sheet but for its rim. */
-static void refine_sheet(sheet *s, const grid *g, int level, fbm_window from)
-{
-    noise_of(s, level, from, FBM_NOISE_CENTRES, 1, 1);
-    noise_of(s, level, from, FBM_NOISE_ROW_EDGES, 1, 0);
-    noise_of(s, level, from, FBM_NOISE_COLUMN_EDGES, 0, 1);
-    const int right = 2 * (int)from.width - 1, below = 2 * (int)from.height - 1;
-    for (int y = 5; y < below - 5; y += 2)
-        for (int x = 5; x < right - 5; x += 2) {
-            coefficients c = where(g, s->i + x, s->j + y);
-            s->z[y][x] = c.w[0] * orbit(s->z, x, y, 1, 1) + c.w[1] * orbit(s->z, x, y, 3, 1) +
-                         c.w[2] * orbit(s->z, x, y, 3, 3) + c.w[3] * orbit(s->z, x, y, 5, 1) + c.t[0] * s->g[y][x] +
-                         c.t[1] * orbit(s->g, x, y, 2, 0) + c.t[2] * orbit(s->g, x, y, 2, 2);
-        }
-    for (int y = 8; y < below - 7; y++)
-        for (int x = 8 + !(y & 1); x < right - 7; x += 2) {
-            coefficients c = where(g, s->i + x, s->j + y);
-            s->z[y][x] = c.w[0] * orbit(s->z, x, y, 1, 0) + c.w[1] * orbit(s->z, x, y, 2, 1) +
-                         c.w[2] * orbit(s->z, x, y, 3, 0) + c.w[3] * orbit(s->z, x, y, 3, 2) + c.edge[0] * s->g[y][x] +
-                         c.edge[1] * orbit(s->g, x, y, 1, 1) + c.edge[2] * orbit(s->g, x, y, 2, 0);
-        }
-}
-
-/* The window of level DEPTH, row by row. */
-static void reference(const model *m, fbm_window target, long double *out)
-{
-    fbm_window windows[DEPTH + 1];
-    windows[DEPTH] = target;
-    for (int l = DEPTH; l > 0; l--)
-        windows[l - 1] = fbm_refine_support(fbm_schemes, windows[l]);
-    sheet *s = calloc(1, sizeof *s), *next = calloc(1, sizeof *next), *swap;
-    grid g = {.vertices = calloc(MOST * MOST, sizeof *g.vertices)};
-    assert_true(s && next && g.vertices);
-    for (size_t y = 0; y < windows[0].height; y++)
-        for (size_t x = 0; x < windows[0].width; x++)
-            s->z[2 * y][2 * x] = (long double)height_at(m, windows[0].i + (int64_t)x, windows[0].j + (int64_t)y);
-    for (int l = 0; l < DEPTH; l++) {
-        s->i = 2 * windows[l].i;
-        s->j = 2 * windows[l].j;
-        make_grid(m, l, windows[l], &g);
-        refine_sheet(s, &g, l, windows[l]);
-        const fbm_window *to = &windows[l + 1];
-        for (size_t y = 0; y < to->height; y++)
-            for (size_t x = 0; x < to->width; x++)
-                next->z[2 * y][2 * x] = s->z[to->j - s->j + (int64_t)y][to->i - s->i + (int64_t)x];
-        swap = s;
-        s = next;
-        next = swap;
-    }
-    for (size_t y = 0; y < target.height; y++)
-        for (size_t x = 0; x < target.width; x++)
-            out[y * target.width + x] = s->z[2 * y][2 * x];
-    free(s);
-    free(next);
-    free(g.vertices);
-}
-
-/* ---- The chain ------------------------------------------------------------------------------------- */
-
-static void chain_of(const model *m, scene_chain *chain)
-{
-    double hursts[SCENE_LEVEL_MAX + 1];
-    *chain = (scene_chain){.mapped = false};
-    for (int l = 0; l <= SCENE_LEVEL_MAX; l++) {
-        hursts[l] = hurst_at(m, 0, 0);
-        chain->steps[l] = (fbm_step){
-            .scheme = fbm_schemes, .seed = SEED, .level = l, .amplitude = (float)(m->delta * exp2(-l * hursts[l]))};
-    }
-    scene_chain_fit_aspect(chain, 1, hursts, SCENE_LEVEL_MAX);
-    if (m->placed)
-        assert_int_equal(scene_chain_fit_places(chain, "chain", NULL), TL_OK);
-}
-
-static double largest_difference(const model *m, int64_t at)
-{
-    scene_chain chain;
-    chain_of(m, &chain);
-    fbm_window window = {at - 5, at / 3 + 11, COLUMNS, ROWS, COLUMNS};
-    float found[COLUMNS * ROWS];
-    long double expected[COLUMNS * ROWS];
-    scene_chain_target target = {.level = DEPTH, .window = window, .out = found};
-    assert_int_equal(scene_chain_run(&chain, &target, load, (void *)m, "chain", NULL), TL_OK);
-    reference(m, window, expected);
-    double largest = 0;
-    for (int k = 0; k < COLUMNS * ROWS; k++) {
-        assert_true(isfinite(found[k]));
-        largest = fmax(largest, (double)fabsl((long double)found[k] - expected[k]));
-    }
-    scene_chain_finish(&chain);
-    return largest;
-}
+enum { DEPTH = 30, SEED = 7 };
 
 static const double deltas[] = {0, 1e-6, 1, 1e6};
 static const int64_t places[] = {0, (int64_t)1 << 40};
 
-/* Thirty levels of rounding: within 1e-5 of delta at every sample. */
+static double largest_difference(const double hurst[2], bool by_place, double delta, int64_t at)
+{
+    tl_precision_options options = {.levels = DEPTH,
+                                    .hurst = {hurst[0], hurst[1]},
+                                    .by_place = by_place,
+                                    .delta = delta,
+                                    .column = at - 5,
+                                    .row = at / 3 + 11,
+                                    .seed = SEED};
+    tl_precision found;
+    tl_error error;
+    assert_int_equal(tl_precision_measure(&options, &found, &error), TL_OK);
+    assert_int_equal(found.samples, 21 * 17);
+    return found.largest;
+}
+
+/* Thirty levels of rounding: within 1e-5 of delta at every sample, and not without any. */
+static void keeps(const double hurst[2], bool by_place)
+{
+    for (size_t d = 0; d < 4; d++)
+        for (int k = 0; k < 2; k++) {
+            double off = largest_difference(hurst, by_place, deltas[d], places[k]);
+            if (!(off <= 1e-5 * deltas[d]) || (deltas[d] > 0 && !(off > 0)))
+                fail_msg("H %g and %g, delta %g: %g off", hurst[0], hurst[1], deltas[d], off);
+        }
+}
+
 static void thirtyLevelsKeepToLongDouble(void **state)
 {
     (void)state;
-    static const double exponents[] = {.01, .1, .5, .99};
+    static const double exponents[][2] = {{.01, .01}, {.1, .1}, {.5, .5}, {.99, .99}};
     for (size_t h = 0; h < 4; h++)
-        for (size_t d = 0; d < 4; d++)
-            for (int k = 0; k < 2; k++) {
-                model m = {.delta = deltas[d], .hurst = {exponents[h], exponents[h]}};
-                double off = largest_difference(&m, places[k]);
-                if (!(off <= 1e-5 * m.delta))
-                    fail_msg("H %g, delta %g: %g off", exponents[h], m.delta, off);
-            }
+        keeps(exponents[h], false);
 }
 
 static void thirtyLevelsOfFieldsKeepToLongDouble(void **state)
@@ -262,13 +53,25 @@ static void thirtyLevelsOfFieldsKeepToLongDouble(void **state)
     (void)state;
     static const double pairs[][2] = {{.01, .01}, {.1, .9}, {.5, .5}, {.99, .99}, {.4, .6}};
     for (size_t h = 0; h < 5; h++)
-        for (size_t d = 0; d < 4; d++)
-            for (int k = 0; k < 2; k++) {
-                model m = {.delta = deltas[d], .hurst = {pairs[h][0], pairs[h][1]}, .placed = true};
-                double off = largest_difference(&m, places[k]);
-                if (!(off <= 1e-5 * m.delta))
-                    fail_msg("H %g and %g, delta %g: %g off", pairs[h][0], pairs[h][1], m.delta, off);
-            }
+        keeps(pairs[h], true);
+}
+
+static void precisionRefusesWhatItCannotMeasure(void **state)
+{
+    (void)state;
+    const tl_precision_options good = {.levels = 1, .hurst = {.5, .5}, .delta = 1};
+    tl_precision_options bad[6] = {good, good, good, good, good, good};
+    bad[0].levels = 31;
+    bad[1].levels = -1;
+    bad[2].hurst[1] = .6;
+    bad[3].hurst[0] = bad[3].hurst[1] = (double)NAN;
+    bad[4].delta = -1;
+    bad[5].row = INT64_MAX;
+    tl_precision found;
+    tl_error error;
+    assert_int_equal(tl_precision_measure(&good, &found, &error), TL_OK);
+    for (size_t k = 0; k < 6; k++)
+        assert_int_equal(tl_precision_measure(&bad[k], &found, &error), TL_ERROR_ARGUMENT);
 }
 
 int main(void)
@@ -276,6 +79,7 @@ int main(void)
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(thirtyLevelsKeepToLongDouble),
         cmocka_unit_test(thirtyLevelsOfFieldsKeepToLongDouble),
+        cmocka_unit_test(precisionRefusesWhatItCannotMeasure),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }

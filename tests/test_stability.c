@@ -32,6 +32,20 @@ static void everyCaseEndsRightOrInOneError(void **state)
     assert_true(refused <= FEW_ARE_REFUSED);
 }
 
+static void everyDepthKeepsToLongDouble(void **state)
+{
+    (void)state;
+    size_t count = 0;
+    for (const report_depth *d = report_depths; d->name; d++, count++) {
+        tl_precision found;
+        tl_error error;
+        assert_int_equal(tl_precision_measure(&d->options, &found, &error), TL_OK);
+        if (!(found.largest <= REPORT_ROUNDING * d->options.delta))
+            fail_msg("%s: %g off", d->name, found.largest);
+    }
+    assert_true(count >= 10);
+}
+
 /* One after the other in one process: what one may take, and what the process is itself. */
 static void casesStayInTheirMemory(void **state)
 {
@@ -83,6 +97,7 @@ int main(void)
 {
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(everyCaseEndsRightOrInOneError),
+        cmocka_unit_test(everyDepthKeepsToLongDouble),
         cmocka_unit_test(casesStayInTheirMemory),
         cmocka_unit_test(casesDoNotDependOnThreads),
         cmocka_unit_test(errorsWhereNoneIsAllowedAreFailures),

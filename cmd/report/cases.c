@@ -137,6 +137,24 @@ const report_case report_cases[] = {
      .cell_x = .001, .cell_y = .001, .fov = 60, .up = .01, .pixel_error = 1},
     {0}};
 
+#define DEPTH(l, h, d, at)                                                                           \
+    {                                                                                                \
+        .levels = (l), .hurst = {(h), (h)}, .delta = (d), .column = (at), .row = (at) / 3, .seed = 5 \
+    }
+
+const report_depth report_depths[] = {{"10 levels, H = 0.5", DEPTH(10, .5, 1, 0)},
+                                      {"20 levels, H = 0.5", DEPTH(20, .5, 1, 0)},
+                                      {"30 levels, H = 0.01", DEPTH(30, .01, 1, 0)},
+                                      {"30 levels, H = 0.1", DEPTH(30, .1, 1, 0)},
+                                      {"30 levels, H = 0.5", DEPTH(30, .5, 1, 0)},
+                                      {"30 levels, H = 0.99", DEPTH(30, .99, 1, 0)},
+                                      {"30 levels, H = 0.5, delta = 1e-6", DEPTH(30, .5, 1e-6, 0)},
+                                      {"30 levels, H = 0.5, delta = 1e6", DEPTH(30, .5, 1e6, 0)},
+                                      {"30 levels, H = 0.5, at column 2^40", DEPTH(30, .5, 1, INT64_C(1) << 40)},
+                                      {"30 levels, H jumps between 0.1 and 0.9",
+                                       {.levels = 30, .hurst = {.1, .9}, .by_place = true, .delta = 1, .seed = 5}},
+                                      {0}};
+
 /* ---- The run of one ---- */
 
 typedef struct trial {

@@ -44,6 +44,16 @@ typedef struct case_result {
 
 enum { CASE_MEMORY = 256 << 20 }; /* bytes that a case may take */
 
+/* Depths at which the field in single precision is held against long double: at most REPORT_ROUNDING of delta apart. */
+typedef struct report_depth {
+    const char *name;
+    tl_precision_options options;
+} report_depth;
+
+#define REPORT_ROUNDING 1e-5
+/* Ended by one without a name. */
+extern const report_depth report_depths[];
+
 void report_run_case(const report_case *c, const tl_run *run, case_result *out);
 
 #endif

@@ -22,6 +22,36 @@ static void add_case(json_t *table, const report_case *c, const case_result *r)
     report_text(row, "remark", r->text);
 }
 
+static tl_status add_precision(json_t *section, tl_error *error)
+{
+    json_t *table = report_table(section, "precision", "Single precision against long double",
+                                 "Heights within delta of 0, refined as deep as this: the field in single precision "
+                                 "against the same recursion in long double with the same noise.");
+    report_column(table, "name", "case", "");
+    report_column(table, "levels", "levels", "");
+    report_column(table, "bound", "bound", "delta");
+    report_column(table, "found", "largest difference", "delta");
+    report_column(table, "samples", "samples looked at", "");
+    report_column(table, "verdict", "end", "");
+    report_column(table, "milliseconds", "time", "ms");
+    for (const report_depth *d = report_depths; d->name; d++) {
+        tl_precision found;
+        double start = progress_clock();
+        tl_status status = tl_precision_measure(&d->options, &found, error);
+        if (status != TL_OK)
+            return status;
+        json_t *row = report_row(table);
+        report_text(row, "name", d->name);
+        report_number(row, "levels", d->options.levels);
+        report_number(row, "bound", REPORT_ROUNDING);
+        report_number(row, "found", found.largest / d->options.delta);
+        report_number(row, "samples", (double)found.samples);
+        report_text(row, "verdict", found.largest <= REPORT_ROUNDING * d->options.delta ? "right" : "failed");
+        report_number(row, "milliseconds", 1e3 * (progress_clock() - start));
+    }
+    return TL_OK;
+}
+
 tl_status report_stability(report *self, tl_error *error)
 {
     json_t *section = report_section(self, "stability", "Stability: stiff and extreme cases",
@@ -56,5 +86,5 @@ tl_status report_stability(report *self, tl_error *error)
         report_run_case(c, &run, &found);
         add_case(table, c, &found);
     }
-    return TL_OK;
+    return add_precision(section, error);
 }

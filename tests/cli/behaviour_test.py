@@ -483,6 +483,8 @@ def reports_keep_their_schema(case):
     expect(all(row["largest"] <= row["bound"] and row["verdict"] == "kept" for row in bounds), f"{bounds}")
     ends = {row["verdict"] for row in tables["cases"]["rows"]}
     expect(ends <= {"right", "refused"}, f"{ends}")
+    depths = tables["precision"]["rows"]
+    expect(len(depths) > 5 and all(0 < row["found"] <= row["bound"] and row["verdict"] == "right" for row in depths), f"{depths}")
     by = {(row["method"], row["factor"]): row for row in tables["methods"]["rows"]}
     expect(by["terrain", 2]["slope"] < by["bilinear", 2]["slope"], "detail is no better than none")
     with open(case.path("made/report.html"), encoding="utf-8") as file:
