@@ -1363,7 +1363,8 @@ def memory_stays_within_what_is_given(case):
     for words in (("info", "large.tif"), ("preview", "large.tif", "-o", "a.png"),
                   ("synth", "large.tif", "-l", 0, "--compression", "none", "-o", "a.exr"),
                   ("synth", "large.tif", "-l", 0, "--compression", "none", "-o", "a.tif"),
-                  ("synth", "large.tif", "-l", 1, "--window", "1000,1000,1024,1024", "-o", "b.tif")):
+                  ("synth", "large.tif", "-l", 1, "--window", "1000,1000,1024,1024", "-o", "b.tif"),
+                  ("tiles", "large.tif", "-f", "exr", "-o", "tiles")):
         peak = case.peak_memory(*words, "--memory", 64, "-q")
         expect(peak < 64 << 20, f"{words[0]}: {peak / 1e6:.1f} MB")
     for words in (("synth", "large.tif", "-l", 0, "-o", "a.glb"), ("preview", "large.tif", "-p", "-o", "b.png")):
@@ -1371,6 +1372,13 @@ def memory_stays_within_what_is_given(case):
         missing = int(re.search(r"raise --memory by (\d+) MB", told).group(1))
         if words[0] == "preview":
             case.run(*words, "--memory", 64 + missing, "-q")
+    for kind in ("quantized-mesh", "3dtiles"):
+        words = ("tiles", EXAMPLE, "-f", kind, "-o", f"site-{kind}", "-t", 2)
+        told = case.run(*words, "--memory", 64, status=1).err
+        enough = 64 + int(re.search(r"raise --memory by (\d+) MB", told).group(1))
+        expect(not os.path.exists(case.path(f"site-{kind}")), f"{kind}: begun without memory")
+        peak = case.peak_memory(*words, "--memory", enough, "-q")
+        expect(peak < enough << 20, f"{kind}: {peak / 1e6:.1f} MB of {enough} MiB")
 
 
 # ---- bad input ----
